@@ -1,0 +1,1 @@
+"""Rendered scenes with known truth, for the demo and the tests."""

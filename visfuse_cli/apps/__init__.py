@@ -1,0 +1,1 @@
+"""What stands on the commands: the demo now, more to come."""

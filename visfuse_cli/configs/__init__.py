@@ -1,0 +1,1 @@
+"""Commented default configurations, one a use, read as package resources."""

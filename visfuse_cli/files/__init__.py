@@ -1,0 +1,1 @@
+"""All reading and writing: video, calibration, tables, tracks, run folders."""

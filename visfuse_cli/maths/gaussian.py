@@ -1,0 +1,109 @@
+"""The Gaussian belief: predict, update, density, moment matching; batched over all leading dimensions."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from visfuse_cli.maths.angles import wrap_at
+from visfuse_cli.records import Array, Gaussian, Innovation
+
+
+def transpose(matrix: NDArray[Any]) -> Array:
+    """Matrices (..., n, m) transposed to (..., m, n)."""
+    return np.swapaxes(matrix, -1, -2)
+
+
+def symmetrise(cov: Array) -> Array:
+    """The symmetric part of covariances (..., n, n); the one place where rounding's asymmetry is removed."""
+    return (cov + transpose(cov)) / 2
+
+
+def times(matrix: Array, vector: Array) -> Array:
+    """Matrices (..., n, m) times vectors (..., m): (..., n)."""
+    return (matrix @ vector[..., None])[..., 0]
+
+
+def predict(belief: Gaussian, F: Array, Q: Array) -> Gaussian:
+    """Belief (..., n) through the linear motion F (..., n, n) with noise Q (..., n, n).
+
+    For a nonlinear motion take `propagate`'s covariance and the motion's own mean. Jia 2008, eqs. 33-34.
+    """
+    return Gaussian(times(F, belief.mean), propagate(belief.cov, F, Q))
+
+
+def propagate(cov: Array, F: Array, Q: Array) -> Array:
+    """Covariance (..., n, n) one step ahead: F P F^T + Q. Lou 2002, eq. 8."""
+    return symmetrise(F @ cov @ transpose(F) + Q)
+
+
+def innovate(belief: Gaussian, residual: Array, H: Array, R: Array) -> tuple[Innovation, Array]:
+    """What a measurement says about a belief (..., n), and the gain (..., n, m). Lou 2002, eq. 7.
+
+    residual (..., m) is z - h(x), its angles wrapped by the caller; H (..., m, n); R (..., m, m).
+    Raises LinAlgError where H P H^T + R is not positive definite.
+    """
+    H_P = H @ belief.cov
+    S = symmetrise(H_P @ transpose(H) + R)
+    gain = transpose(np.linalg.solve(S, H_P))
+    nis, log_likelihood = _density(residual, S)
+    return Innovation(np.broadcast_to(residual, nis.shape + S.shape[-1:]), S, nis, log_likelihood), gain
+
+
+def update(belief: Gaussian, residual: Array, H: Array, R: Array) -> tuple[Gaussian, Innovation]:
+    """Belief (..., n) after a measurement, in Joseph form; arguments as in `innovate`. Lou 2002, eqs. 5, 9.
+
+    Raises LinAlgError where H P H^T + R is not positive definite.
+    """
+    innovation, gain = innovate(belief, residual, H, R)
+    return correct(belief, innovation.residual, H, R, gain), innovation
+
+
+def correct(belief: Gaussian, residual: Array, H: Array, R: Array, gain: Array) -> Gaussian:
+    """Belief (..., n) after a measurement taken in with any gain (..., n, m), optimal or not (Joseph form)."""
+    keep = np.eye(belief.mean.shape[-1]) - gain @ H
+    cov = keep @ belief.cov @ transpose(keep) + gain @ R @ transpose(gain)
+    return Gaussian(belief.mean + times(gain, residual), symmetrise(cov))
+
+
+def log_density(residual: Array, cov: Array) -> Array:
+    """Log of the normal density (...) at residuals (..., n) with covariances (..., n, n).
+
+    Raises LinAlgError where a covariance is not positive definite.
+    """
+    return _density(residual, cov)[1]
+
+
+def mahalanobis(residual: Array, cov: Array) -> Array:
+    """Squared Mahalanobis length (...) of residuals (..., n) with covariances (..., n, n).
+
+    Raises LinAlgError where a covariance is not positive definite.
+    """
+    return _density(residual, cov)[0]
+
+
+def _density(residual: Array, cov: Array) -> tuple[Array, Array]:
+    L = np.linalg.cholesky(cov)
+    whitened = np.linalg.solve(L, residual[..., None])[..., 0]
+    distance = np.sum(whitened**2, axis=-1)
+    log_root_det = np.sum(np.log(np.diagonal(L, axis1=-2, axis2=-1)), axis=-1)
+    return distance, -0.5 * distance - log_root_det - 0.5 * cov.shape[-1] * np.log(2 * np.pi)
+
+
+def moment_match(means: Array, covs: Array, log_weights: Array, angles: tuple[int, ...] = ()) -> Gaussian:
+    """One Gaussian (..., n) with the mean and covariance of a mixture of M. Jia 2008, eqs. 30-31.
+
+    means (..., M, n), covs (..., M, n, n), log_weights (..., M) up to a common constant; components listed in
+    `angles` (rad) are averaged on the circle, around the heaviest component.
+    """
+    weights = np.exp(log_weights - np.max(log_weights, axis=-1, keepdims=True))
+    weights = weights / np.sum(weights, axis=-1, keepdims=True)
+    heaviest = np.argmax(weights, axis=-1)[..., None, None]
+    origin = np.take_along_axis(means, heaviest, axis=-2)
+    offsets = wrap_at(means - origin, angles)
+    shift = np.sum(weights[..., None] * offsets, axis=-2)
+    spread = offsets - shift[..., None, :]
+    cov = np.sum(weights[..., None, None] * (covs + spread[..., :, None] * spread[..., None, :]), axis=-3)
+    return Gaussian(wrap_at(origin[..., 0, :] + shift, angles), symmetrise(cov))

@@ -1,0 +1,155 @@
+"""Every type that crosses a module border: frozen, no logic; arrays are float64 unless said otherwise."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Image = NDArray[np.uint8]
+
+
+@dataclass(frozen=True, slots=True)
+class Frame:
+    """One decoded picture: `index` is the 0-based decode index, `t` (s) its presentation time less the first stamp."""
+
+    camera: str
+    index: int
+    t: float
+    image: Image  # (H, W, 3) BGR
+
+
+@dataclass(frozen=True, slots=True)
+class FrameSet:
+    """The frames of several views that belong to one instant; a view without a frame is in `missing`."""
+
+    t: float
+    frames: dict[str, Frame]
+    missing: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class TimeAudit:
+    """What the time stamps of one clip say about its recording."""
+
+    frames: int
+    duration_s: float
+    nominal_interval_s: float
+    dropped: int  # frames missing in gaps of the stamps
+    irregular: int  # intervals off the nominal one by more than a fifth
+    duplicated: int  # equal stamps, or pictures identical in every pixel
+    lost: int  # frames announced by the container that could not be decoded
+    warnings: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Gaussian:
+    """A belief: mean (..., n), cov (..., n, n)."""
+
+    mean: Array
+    cov: Array
+
+
+@dataclass(frozen=True, slots=True)
+class Innovation:
+    """What a measurement said about a prediction: residual (..., m), its cov (..., m, m), nis and log-likelihood (...)."""
+
+    residual: Array
+    cov: Array
+    nis: Array
+    log_likelihood: Array
+
+
+@dataclass(frozen=True, slots=True)
+class Lens:
+    """Pinhole and distortion of one camera: K (3, 3) px, D (k,) in OpenCV's order; footage is undistorted to K."""
+
+    K: Array
+    D: Array
+
+
+@dataclass(frozen=True, slots=True)
+class GroundMap:
+    """Image (or gaze frontal plane) to ground metres: a homography with the covariance of its entries.
+
+    ground_from_image (3, 3) at its stated scale, cov (9, 9) of its entries row by row (rank 8); `ground_sign` is
+    the sign of the third homogeneous coordinate on the visible side of the horizon.
+    """
+
+    ground_from_image: Array
+    cov: Array
+    ground_sign: int
+    input: str  # "pixel" or "gaze"
+    image_size: tuple[int, int] | None
+    lens: Lens | None
+    rms_m: float
+    rms_px: float
+    residuals: tuple[dict[str, Any], ...] = ()
+    source: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Region:
+    """One connected moving region: box (4,) px, hull (k, 2) px of its outline, which hull points lie on the border."""
+
+    box: Array
+    hull: Array
+    at_border: NDArray[np.bool_]  # (k,): the frame's edge was seen there and not the thing's own
+    area: float
+    score: float = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class Measurement:
+    """z (m,) with covariance R (m, m) at time t (s)."""
+
+    z: Array
+    R: Array
+    t: float
+
+
+@dataclass(frozen=True, slots=True)
+class RunRequest:
+    """What the command line asks of one tracking command."""
+
+    command: str
+    input: Path
+    out: Path
+    config: Any  # the command's own frozen model
+    options: dict[str, Any] = field(default_factory=dict)
+    overwrite: bool = False
+    video: bool = True
+    report: bool = True
+    start: float | None = None
+    end: float | None = None
+    seed: int = 0
+    progress: bool = True
+    argv: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class RunResult:
+    """What a command leaves behind: the output folder, its summary, warnings, and the signal that cut it short."""
+
+    out: Path
+    summary: dict[str, Any]
+    warnings: tuple[str, ...] = ()
+    stopped_by: int | None = None  # signal number
+
+
+@dataclass(frozen=True, slots=True)
+class GroundCamera:
+    """A camera over the ground plane: P (3, 4) world metres (z up from the plane) -> undistorted pixels.
+
+    The columns for X, Y and 1 reproduce the ground map exactly; `centre` (3,) m, `focal` px.
+    """
+
+    image_from_world: Array
+    ground: GroundMap
+    centre: Array
+    focal: float
+    image_size: tuple[int, int]

@@ -1,0 +1,73 @@
+"""The annotated video: the footage decoded a second time with the settled tracks drawn on it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from typing import Any
+
+import numpy as np
+
+from visfuse_cli.maths.cameras import project
+from visfuse_cli.records import Array, Frame, GroundCamera, Image
+from visfuse_cli.tracking.output import box_corners
+from visfuse_cli.vision import drawing
+from visfuse_cli.vision.lens import distort_points
+
+TRAIL_S = 2.0
+UNITS = {"km/h": 3.6, "mph": 2.2369362920544, "m/s": 1.0}
+
+
+class _Drawn:
+    """One track, ready to be drawn on its frames."""
+
+    def __init__(self, record: dict[str, Any], camera: GroundCamera, units: str) -> None:
+        states = record["states"]
+        self.first, self.last = states[0]["frame"], states[-1]["frame"]
+        self._row = {state["frame"]: k for k, state in enumerate(states)}
+        position = np.array([state["position"] for state in states])
+        pose = np.column_stack([position, [state["heading"] for state in states]])
+        self._corners = box_corners(camera, pose, np.tile(record["summary"]["size"], (len(pose), 1)))
+        self._feet = _on_image(camera, position)
+        self._measured = [state["measured"] for state in states]
+        self._t = np.array([state["t"] for state in states])
+        summary, factor = record["summary"], UNITS[units]
+        half = (summary["speed_ci95"][1] - summary["speed_ci95"][0]) / 2
+        self._text = f"{record['id']}  {summary['speed'] * factor:.1f} +-{half * factor:.1f} {units}"
+        self._colour = drawing.colour_of(record["id"])
+        if summary["rejected"]:
+            self._text = f"{record['id']}  rejected"
+            self._colour = (150, 150, 150)
+
+    def draw(self, image: Image, frame: int) -> None:
+        k = self._row.get(frame)
+        if k is None:
+            return
+        begin = int(np.searchsorted(self._t, self._t[k] - TRAIL_S))
+        drawing.polyline(image, self._feet[begin : k + 1], self._colour)
+        drawing.box(image, self._corners[k], self._colour, dashed=not self._measured[k])
+        if np.isfinite(self._corners[k]).all():
+            corner = self._corners[k].min(axis=0)
+            drawing.label(image, self._text, corner - [0, 4], self._colour)
+
+
+def _on_image(camera: GroundCamera, position: Array) -> Array:
+    pixels, _ = project(camera, np.column_stack([position, np.zeros(len(position))]))
+    return pixels if camera.ground.lens is None else distort_points(pixels, camera.ground.lens)
+
+
+def annotate(
+    frames: Iterable[Frame], records: Iterable[dict[str, Any]], camera: GroundCamera, units: str
+) -> Iterator[Frame]:
+    """Draw the tracks, given in the order of their first frames, on the frames; only the tracks in view are held."""
+    waiting = iter(records)
+    upcoming = next(waiting, None)
+    active: list[_Drawn] = []
+    for frame in frames:
+        while upcoming is not None and upcoming["states"][0]["frame"] <= frame.index:
+            active.append(_Drawn(upcoming, camera, units))
+            upcoming = next(waiting, None)
+        active = [drawn for drawn in active if drawn.last >= frame.index]
+        for drawn in active:
+            drawn.draw(frame.image, frame.index)
+        drawing.label(frame.image, f"{frame.t:.2f} s", np.array([4.0, frame.image.shape[0]]), (230, 230, 230))
+        yield frame

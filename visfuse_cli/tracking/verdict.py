@@ -1,0 +1,124 @@
+"""The speed of a finished track with its 95 % interval, or the reason why it gets none."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from pydantic import Field
+
+from visfuse_cli.config import Section
+from visfuse_cli.maths.speed import way
+from visfuse_cli.records import Array
+from visfuse_cli.tracking.conclude import Path
+
+Z95 = 1.959964
+
+
+class SpeedSettings(Section):
+    """What it takes to be given a speed; a track that fails goes to rejected.csv with the reason."""
+
+    min_frames: int = Field(6, ge=3, le=10000, description="measured frames")
+    min_duration_s: float = Field(0.4, gt=0, le=600, description="s: shortest stretch a speed is measured over")
+    min_distance_m: float = Field(2.0, gt=0, le=1000, description="m: shortest way a speed is measured over")
+    max_sigma: float = Field(0.15, gt=0, le=10, description="standard deviation over speed: above, too uncertain")
+    max_acceleration: float = Field(9.0, gt=0, le=100, description="m/s^2: above, the track has jumped")
+    max_misfit: float = Field(0.2, gt=0, le=5, description="outline misfit over outline size: above, no such box")
+    max_refused: float = Field(
+        0.5, gt=0, le=1, description="share of measurements outside the gate: above, inconsistent"
+    )
+    sigma_t_s: float = Field(0.0005, ge=0, le=1, description="s: noise of one time stamp")
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """A stretch [first, last] of a path: mean speed and deviation (m/s), its parts, way (m), course (rad), reason or ''."""
+
+    first: int
+    last: int
+    speed: float
+    sigma: float
+    distance: float
+    course: float
+    reason: str
+
+
+def judge(path: Path, entry_cov: Array, bias_px: float, settings: SpeedSettings) -> Verdict:
+    """Measure the mean speed over the stretch where it is known best relative to itself, and test the track.
+
+    The stretch's ends may lie anywhere on the measured path that leaves it long enough; pose noise shrinks with
+    length, calibration doubt grows away from the surveyed points, and the stretch balances the two.
+    """
+    position, velocity = path.planar.mean[:, :2], path.planar.mean[:, 2:]
+    tangent = velocity / np.maximum(np.linalg.norm(velocity, axis=1, keepdims=True), 1e-6)
+    length = way(position, tangent)
+    first, last, sigma = _best_stretch(path, length, tangent, entry_cov, bias_px, settings)
+    duration = path.t[last] - path.t[first]
+    distance = length[last] - length[first]
+    speed = distance / duration if duration > 0 else 0.0
+    moved = position[last] - position[first]
+    course = float(np.arctan2(moved[1], moved[0]))
+    verdict = Verdict(first, last, float(speed), float(sigma), float(distance), course, "")
+    return replace(verdict, reason=_reason(path, verdict, settings))
+
+
+def _best_stretch(
+    path: Path, length: Array, tangent: Array, entry_cov: Array, bias_px: float, settings: SpeedSettings
+) -> tuple[int, int, float]:
+    """First and last state, and the deviation of the mean speed between them (m/s)."""
+    seen = np.flatnonzero(path.measured)
+    grid = np.unique(seen[np.linspace(0, len(seen) - 1, min(len(seen), 48)).astype(int)])
+    i, j = (index.ravel() for index in np.meshgrid(grid, grid, indexing="ij"))
+    duration, distance = path.t[j] - path.t[i], length[j] - length[i]
+    allowed = (duration >= settings.min_duration_s) & (distance >= settings.min_distance_m)
+    if not allowed.any():
+        allowed = (i == grid[0]) & (j == grid[-1])
+    i, j, duration, distance = i[allowed], j[allowed], duration[allowed], distance[allowed]
+    along = np.einsum("ti,tij,tj->t", tangent, path.pose_cov[:, :2, :2], tangent)
+    pose = along[i] + along[j]
+    # d length / d H, summed up to each state: a stretch's share is the difference of two sums.
+    steps = np.diff(path.calibration[:, :2], axis=0)
+    pull = np.einsum("td,tdh->th", tangent[1:] + tangent[:-1], steps) / 2
+    total = np.concatenate([np.zeros((1, 9)), np.cumsum(pull, axis=0)])
+    g = total[j] - total[i]
+    calibration = np.einsum("sh,hk,sk->s", g, entry_cov, g)
+    slip = np.einsum("td,tdp->tp", tangent, path.pixel)  # m along the way for a pixel
+    bias = bias_px**2 * np.sum((slip[j] - slip[i]) ** 2, axis=1)
+    stamps = 2 * (distance / np.maximum(duration, 1e-9) * settings.sigma_t_s) ** 2
+    sigma_way = np.sqrt(pose + np.clip(calibration, 0, None) + bias + stamps)
+    best = int(np.argmin(sigma_way / np.maximum(distance, 1e-3)))
+    return int(i[best]), int(j[best]), float(sigma_way[best] / max(duration[best], 1e-9))
+
+
+def _reason(path: Path, verdict: Verdict, settings: SpeedSettings) -> str:
+    """Why this track gets no speed; empty when it does. Nothing is clamped: a track is believed or rejected."""
+    duration = path.t[verdict.last] - path.t[verdict.first]
+    frames = int(path.measured[verdict.first : verdict.last + 1].sum())
+    speed = np.linalg.norm(path.planar.mean[:, 2:], axis=1)
+    spacing = np.maximum(np.diff(path.t), 1e-6)
+    # Over a third of a second, so that one frame's noise is not taken for a jump.
+    reach = max(1, round(0.3 / float(np.median(spacing)))) if len(spacing) else 1
+    change = np.abs(speed[reach:] - speed[:-reach]) / np.maximum(path.t[reach:] - path.t[:-reach], 1e-6)
+    refused = path.refused / max(1, path.refused + int(path.measured.sum()))
+    if path.ended_by.startswith("same vehicle"):
+        return path.ended_by
+    if frames < settings.min_frames or duration < settings.min_duration_s:
+        return f"too short: {frames} measured frames over {duration:.2f} s"
+    if verdict.distance < settings.min_distance_m:
+        return f"hardly moved: {verdict.distance:.1f} m"
+    if len(change) and float(change.max()) > settings.max_acceleration:
+        return f"jump: speed changes by {change.max():.0f} m/s^2"
+    if refused > settings.max_refused:
+        return f"inconsistent: {100 * refused:.0f} % of the measurements outside the gate"
+    outline = _outline_px(path)
+    if np.isfinite(path.misfit_px) and path.misfit_px > settings.max_misfit * outline + 3:
+        return f"no box fits: outline off by {path.misfit_px:.0f} px (several vehicles, a shadow or a reflection)"
+    if verdict.sigma > settings.max_sigma * abs(verdict.speed):
+        return f"too uncertain: {verdict.speed * 3.6:.0f} +- {verdict.sigma * Z95 * 3.6:.0f} km/h, outside the trusted zone"
+    return ""
+
+
+def _outline_px(path: Path) -> float:
+    """Typical size of the target in the image (px)."""
+    scale = np.sqrt(np.abs(np.linalg.det(path.pixel)))  # m per px
+    return float(np.median(path.size[2] / np.maximum(scale, 1e-9)))

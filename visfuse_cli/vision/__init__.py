@@ -1,0 +1,1 @@
+"""Pixels in, measurements out: the only rooms that know OpenCV besides reading and writing files."""

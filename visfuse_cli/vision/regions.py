@@ -1,0 +1,125 @@
+"""Foreground pixels to regions, cleaned at a scale that follows the ground plane."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from visfuse_cli.maths.cameras import project
+from visfuse_cli.maths.homography import apply
+from visfuse_cli.records import Array, GroundCamera, Image, Lens, Region
+from visfuse_cli.vision.background import FOREGROUND
+from visfuse_cli.vision.lens import undistort_points
+
+
+@dataclass(frozen=True, slots=True)
+class Band:
+    """Image rows in which one metre of height covers about `scale` px."""
+
+    top: int
+    bottom: int
+    scale: float
+
+
+def bands(camera: GroundCamera) -> list[Band]:
+    """Cut the image into bands of rows whose scale stays within a factor of 1.4.
+
+    The scale of a row is that of an upright metre standing on the ground in the middle of it.
+    """
+    width, height = camera.image_size
+    rows = np.arange(height, dtype=float)
+    feet = np.column_stack([np.full(height, width / 2), rows])
+    H = camera.ground.ground_from_image
+    visible = (feet @ H[2, :2] + H[2, 2]) * camera.ground.ground_sign > 0
+    scale = np.full(height, np.nan)
+    if visible.any():
+        ground = apply(H, feet[visible])
+        tops, _ = project(camera, np.column_stack([ground, np.ones(len(ground))]))
+        scale[visible] = np.linalg.norm(tops - feet[visible], axis=1)
+    known = np.isfinite(scale)
+    if not known.any():
+        return [Band(0, height, 20.0)]
+    scale = np.interp(rows, rows[known], scale[known])
+    octave = np.round(2 * np.log2(np.clip(scale, 2, 400))).astype(int)
+    starts = np.flatnonzero(np.diff(octave, prepend=octave[0] - 1))
+    ends = np.append(starts[1:], height)
+    return [Band(int(a), int(b), float(2 ** (octave[a] / 2))) for a, b in zip(starts, ends, strict=True)]
+
+
+def clean(mask: Image, cut: list[Band], gap_m: float, speck_m: float) -> Image:
+    """Close gaps up to `gap_m` and remove specks below `speck_m` of a binary mask, in metres at each band's scale."""
+    out = np.empty_like(mask)
+    for band in cut:
+        close, open_ = (_kernel(size * band.scale) for size in (gap_m, speck_m))
+        margin = max(close.shape[0], open_.shape[0])
+        top, bottom = max(0, band.top - margin), min(len(mask), band.bottom + margin)
+        strip = mask[top:bottom]
+        # A border of background keeps closing from gluing regions to the frame's edge.
+        strip = cv2.morphologyEx(strip, cv2.MORPH_OPEN, open_)
+        strip = cv2.morphologyEx(strip, cv2.MORPH_CLOSE, close, borderType=cv2.BORDER_CONSTANT, borderValue=0)
+        out[band.top : band.bottom] = strip[band.top - top : band.bottom - top]
+    return out
+
+
+def _kernel(size: float) -> Image:
+    side = int(np.clip(round(size), 1, 61))
+    return np.ones((side, side), np.uint8)
+
+
+def find(
+    labels: Image, cut: list[Band], gap_m: float, speck_m: float, smallest_m: float, shadows: bool = False
+) -> list[Region]:
+    """Regions of a labelled picture (255 foreground, 127 shadow): connected, cleaned, at least `smallest_m` tall or wide.
+
+    Shadows are dropped unless `shadows`. Hulls run through pixel centres.
+    """
+    threshold = 0 if shadows else FOREGROUND - 1
+    _, mask = cv2.threshold(labels, threshold, 255, cv2.THRESH_BINARY)
+    mask = clean(mask, cut, gap_m, speck_m)
+    contours, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
+    height, width = mask.shape
+    scale = np.concatenate([np.full(band.bottom - band.top, band.scale) for band in cut])
+    found = []
+    for contour in contours:
+        x, y, w, h = cv2.boundingRect(contour)
+        if max(w, h) < smallest_m * scale[y + h - 1] or min(w, h) < 2:
+            continue
+        hull = cv2.convexHull(contour).reshape(-1, 2).astype(float)
+        box = np.array([x - 0.5, y - 0.5, w, h], dtype=float)
+        found.append(Region(box, hull, at_border(hull, (width, height)), float(cv2.contourArea(contour))))
+    return found
+
+
+def at_border(hull: Array, frame_size: tuple[int, int]) -> NDArray[np.bool_]:
+    """Which hull points (k, 2) px lie on the border of a frame (w, h)."""
+    return np.asarray(np.any((hull <= 1.5) | (hull >= np.array(frame_size) - 2.5), axis=1))
+
+
+def joined(parts: list[Region]) -> Region:
+    """One region around several fragments of the same thing."""
+    if len(parts) == 1:
+        return parts[0]
+    points = np.concatenate([part.hull for part in parts])
+    border = np.concatenate([part.at_border for part in parts])
+    kept = cv2.convexHull(points.astype(np.float32), returnPoints=False).ravel()
+    corner = np.min([part.box[:2] for part in parts], axis=0)
+    far = np.max([part.box[:2] + part.box[2:] for part in parts], axis=0)
+    box = np.concatenate([corner, far - corner])
+    return Region(box, points[kept], border[kept], sum(p.area for p in parts), max(p.score for p in parts))
+
+
+def from_box(box: Array, score: float, frame_size: tuple[int, int]) -> Region:
+    """A region from an external detection box [x, y, w, h] px."""
+    x, y, w, h = box
+    hull = np.array([[x, y], [x + w, y], [x + w, y + h], [x, y + h]])
+    return Region(np.asarray(box, dtype=float), hull, at_border(hull, frame_size), float(w * h), score)
+
+
+def undistorted(region: Region, lens: Lens) -> Region:
+    """The region as a camera without distortion would see it."""
+    hull = undistort_points(region.hull, lens)
+    low, high = hull.min(axis=0) - 0.5, hull.max(axis=0) + 0.5
+    return Region(np.concatenate([low, high - low]), hull, region.at_border, region.area, region.score)
