@@ -6,7 +6,8 @@ frames -> background -> regions -> tracker (predict, measure, update) -> conclud
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any, Literal
 
@@ -19,19 +20,24 @@ from visfuse_cli.files import detections as detection_files
 from visfuse_cli.files import homography as homography_files
 from visfuse_cli.files.run_json import write_run_json
 from visfuse_cli.files.runfolder import RunFolder
-from visfuse_cli.files.spool import TrackSpool
-from visfuse_cli.files.video import VideoSource, is_clip_folder, list_clips, open_source
+from visfuse_cli.files.spool import TrackSpool, write_table
+from visfuse_cli.files.video import VideoSource, describe, is_clip_folder, list_clips, open_source
+from visfuse_cli.files.video_writer import VideoWriter
 from visfuse_cli.maths.cameras import ground_camera
 from visfuse_cli.pipeline import Run
-from visfuse_cli.records import Array, Frame, GroundCamera, Region, RunRequest, RunResult
-from visfuse_cli.tracking.annotate import annotate
+from visfuse_cli.records import Array, Frame, GroundCamera, GroundMap, Region, RunRequest, RunResult, TimeAudit
+from visfuse_cli.tracking.annotate import UNITS, annotate
 from visfuse_cli.tracking.conclude import conclude
 from visfuse_cli.tracking.ground import Abandoned, GroundTracker, Track
-from visfuse_cli.tracking.output import abandoned_row, lane_of, row_of, track_record
+from visfuse_cli.tracking.output import COLUMNS, abandoned_row, lane_of, row_of, track_record
 from visfuse_cli.tracking.settings import TrackerSettings
 from visfuse_cli.tracking.verdict import SpeedSettings, judge
 from visfuse_cli.vision import regions as region_tools
 from visfuse_cli.vision.background import Background, median_picture
+from visfuse_cli.vision.lens import distort_points
+
+WARMUP_PICTURES = 31  # an odd number, so that the median is a picture's own value
+SEEN_FRAMES = 8  # a region seen for fewer frames than this is noise and not worth a line in the ledger
 
 Polygon = tuple[tuple[float, float], ...]
 
@@ -55,8 +61,9 @@ class BackgroundSettings(Section):
 class RegionSettings(Section):
     """Cleaning of the foreground, in metres at the scale of the ground."""
 
-    gap: float = Field(0.35, ge=0, le=5, description="m: gaps up to this size are closed")
-    speck: float = Field(0.12, ge=0, le=5, description="m: specks below this size are removed")
+    gap: float = Field(0.5, ge=0, le=5, description="m: gaps up to this size are closed")
+    bridge: float = Field(0.9, ge=0, le=5, description="m: gaps up to this size are closed where they look like shadow")
+    speck: float = Field(0.15, ge=0, le=5, description="m: specks below this size are removed")
 
 
 class DisplaySettings(Section):
@@ -82,3 +89,289 @@ class SpeedConfig(TrackerSettings):
             if len(polygon) < 3:
                 raise ValueError(f"lane {number} has {len(polygon)} corners; a polygon needs three or more")
         return lanes
+
+
+@dataclass(slots=True)
+class _Results:
+    """What a run has found so far: table rows (small) and where each clip's tracks begin."""
+
+    rows: list[dict[str, Any]] = field(default_factory=list)
+    rejected: list[dict[str, Any]] = field(default_factory=list)
+    speeds: list[float] = field(default_factory=list)  # m/s
+    drawn: dict[str, list[tuple[int, int]]] = field(default_factory=dict)  # clip -> (first frame, id)
+    audits: dict[str, TimeAudit] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class _Clip:
+    """One recording and everything its frames need."""
+
+    name: str
+    source: VideoSource
+    camera: GroundCamera
+    config: SpeedConfig
+    boxes: dict[int, Array] | None
+
+
+def run(request: RunRequest) -> RunResult:
+    """Measure every recording of `request.input`; raises a VisfuseError before the first frame where an input is bad."""
+    config: SpeedConfig = request.config
+    ground = _ground_map(request.options["homography"])
+    several = is_clip_folder(request.input)
+    clips = list_clips(request.input) if several else [request.input]
+    boxes = _boxes(request.options.get("detections"), several)
+    inputs = [describe(path) for path in (*clips, request.options["homography"], request.options.get("detections")) if path]
+    for path in clips:
+        with _open(path, request) as source:
+            _check_size(source, ground, path)
+    results = _Results()
+    with (
+        RunFolder(request.out, request.overwrite) as folder,
+        Run(request.progress) as run_,
+        TrackSpool(folder, "speed", request.seed, "ground") as spool,
+    ):
+        next_id = 1
+        for path in clips:
+            with _open(path, request) as source:
+                camera = ground_camera(ground, (source.width, source.height))
+                clip = _Clip(path.name, source, camera, config, boxes)
+                next_id = _track(clip, run_, spool, results, next_id, path.name if several else None)
+            if run_.stopped_by is not None:
+                break
+        write_table(folder / "speeds.csv", COLUMNS, results.rows)
+        write_table(folder / "rejected.csv", (*COLUMNS, "reason"), results.rejected)
+        if request.video and run_.stopped_by is None:
+            for path in clips:
+                if path.name in results.drawn:
+                    name = f"annotated-{path.stem}.mp4" if several else "annotated.mp4"
+                    _annotate(path, folder / name, ground, request, run_, spool, results.drawn[path.name])
+        summary = _summary(results, run_, config, folder)
+        write_run_json(
+            folder / "run.json",
+            command="speed",
+            argv=request.argv,
+            config=config.model_dump(mode="json"),
+            inputs=inputs,
+            seed=request.seed,
+            started=run_.started,
+            audits=results.audits,
+            warnings=run_.warnings,
+            counts=run_.counts,
+            stages=run_.stages,
+            stopped_by=run_.stopped_by,
+            extra={"summary": summary, "annotated_by": "a second decode of the footage" if request.video else None},
+        )
+    return RunResult(request.out, summary, run_.warnings, run_.stopped_by)
+
+
+def _ground_map(path: Path) -> GroundMap:
+    ground = homography_files.read(path)
+    if ground.input != "pixel":
+        raise InputError(f"{path}: maps gaze angles; speed needs a homography from image points or lines")
+    return ground
+
+
+def _boxes(path: Path | None, several: bool) -> dict[int, Array] | None:
+    if path is None:
+        return None
+    if several:
+        raise InputError(f"{path}: detections belong to one recording; give speed one clip, not a folder of clips")
+    return detection_files.read_mot(path)
+
+
+def _open(path: Path, request: RunRequest) -> VideoSource:
+    return open_source(path, fps=request.config.video.fps, start=request.start, end=request.end)
+
+
+def _check_size(source: VideoSource, ground: GroundMap, path: Path) -> None:
+    size = (source.width, source.height)
+    if ground.image_size is not None and size != ground.image_size:
+        wide, high = ground.image_size
+        raise InputError(
+            f"{path}: is {size[0]}x{size[1]}, but the homography was made for {wide}x{high}; calibrate at this size"
+        )
+
+
+def _track(clip: _Clip, run_: Run, spool: TrackSpool, results: _Results, first_id: int, label: str | None) -> int:
+    """Follow everything in one clip; returns the next free id."""
+    tracker = GroundTracker(clip.camera, clip.config, first_id, upright=clip.boxes is not None)
+    results.drawn[clip.name] = []
+    look = _Detections(clip) if clip.boxes is not None else _MovingRegions(clip, run_)
+    for frame in run_.frames(clip.source):
+        with run_.stage("detect"):
+            regions = look.regions(frame)
+        with run_.stage("track"):
+            tracker.predict(frame.t)
+            ended = tracker.update(frame.index, regions)
+        with run_.stage("conclude"):
+            _settle(*ended, clip, tracker, run_, spool, results, label)
+        with run_.stage("learn"):
+            look.learn(frame, tracker.outlines())
+        run_.count("frames")
+    _settle(*tracker.finish(), clip, tracker, run_, spool, results, label)
+    audit = results.audits[clip.name] = clip.source.audit()
+    for warning in audit.warnings:
+        run_.warn(warning)
+    return tracker.next_id
+
+
+class _MovingRegions:
+    """Regions that differ from the adaptive background."""
+
+    def __init__(self, clip: _Clip, run_: Run) -> None:
+        settings = clip.config.background
+        self._clip = clip
+        self._bands = region_tools.bands(clip.camera)
+        self._background = Background(settings.model, settings.threshold, settings.shadow_ratio)
+        with run_.stage("warm up"):
+            self._background.start(median_picture(_sampled(clip.source, settings.warmup_s)))
+        self._t = 0.0
+
+    def regions(self, frame: Frame) -> list[Region]:
+        labels = self._background.detect(frame.image)
+        settings, smallest = self._clip.config.regions, self._clip.config.target.smallest
+        found = region_tools.find(labels, self._bands, settings.gap, settings.bridge, settings.speck, smallest)
+        lens = self._clip.camera.ground.lens
+        return found if lens is None else [region_tools.undistorted(region, lens) for region in found]
+
+    def learn(self, frame: Frame, followed: list[Array]) -> None:
+        elapsed, self._t = max(frame.t - self._t, 0.0), frame.t
+        lens = self._clip.camera.ground.lens
+        if lens is not None:
+            followed = [distort_points(outline, lens) for outline in followed if len(outline)]
+        self._background.learn(frame.image, elapsed / self._clip.config.background.memory_s, followed)
+
+
+def _sampled(source: VideoSource, warmup_s: float) -> Iterator[Any]:
+    """Pictures spread over the first `warmup_s` seconds; the first picture at least."""
+    step = max(1, round(warmup_s * source.nominal_rate / WARMUP_PICTURES))
+    first: float | None = None
+    for number, frame in enumerate(source.frames()):
+        first = frame.t if first is None else first
+        if number and frame.t - first >= warmup_s:
+            return
+        if number % step == 0:
+            yield frame.image
+
+
+class _Detections:
+    """Regions from external boxes."""
+
+    def __init__(self, clip: _Clip) -> None:
+        self._boxes = clip.boxes or {}
+        self._size = clip.camera.image_size
+        self._lens = clip.camera.ground.lens
+
+    def regions(self, frame: Frame) -> list[Region]:
+        rows = self._boxes.get(frame.index, np.zeros((0, 5)))
+        found = [region_tools.from_box(row[:4], row[4], self._size) for row in rows]
+        return found if self._lens is None else [region_tools.undistorted(region, self._lens) for region in found]
+
+    def learn(self, frame: Frame, followed: list[Array]) -> None:
+        """Boxes from outside need no background."""
+
+
+def _settle(
+    tracks: list[Track],
+    abandoned: list[Abandoned],
+    clip: _Clip,
+    tracker: GroundTracker,
+    run_: Run,
+    spool: TrackSpool,
+    results: _Results,
+    label: str | None,
+) -> None:
+    """Turn what ended into records and table rows."""
+    config, begun = clip.config, clip.source.creation_time
+    for track in tracks:
+        path = conclude(track, clip.camera, config, tracker.dynamics)
+        verdict = judge(path, clip.camera.ground.cov, config.pose.bias_px, config.speed)
+        spool.add(track_record(path, verdict, clip.camera, label))
+        results.drawn[clip.name].append((int(path.frame[0]), path.id))
+        lanes = [np.array(polygon) for polygon in config.lanes]
+        lane = lane_of(path.planar.mean[(verdict.first + verdict.last) // 2, :2], lanes)
+        row = row_of(path, verdict, clip.name, _utc(begun, path.t[verdict.first]), lane)
+        if verdict.reason:
+            results.rejected.append(row)
+            run_.count("rejected")
+        else:
+            results.rows.append(row)
+            results.speeds.append(verdict.speed)
+            run_.count("vehicles")
+    for candidate in abandoned:
+        if len(candidate.samples) >= SEEN_FRAMES:
+            results.rejected.append(abandoned_row(candidate, clip.name, _utc(begun, candidate.samples[0].t)))
+        run_.count("regions that never became a track")
+
+
+def _utc(begun: datetime | None, t: float) -> str:
+    if begun is None:
+        return ""
+    moment = (begun + timedelta(seconds=float(t))).astimezone(UTC)
+    return moment.isoformat(timespec="milliseconds").replace("+00:00", "Z")
+
+
+def _annotate(
+    path: Path,
+    out: Path,
+    ground: GroundMap,
+    request: RunRequest,
+    run_: Run,
+    spool: TrackSpool,
+    drawn: list[tuple[int, int]],
+) -> None:
+    """Write the annotated video of one clip from a second decode; a stop request ends it early and readable."""
+    units = request.config.display.units
+    with _open(path, request) as source:
+        camera = ground_camera(ground, (source.width, source.height))
+        records = (spool.read(identity) for _, identity in sorted(drawn))
+        with (
+            VideoWriter(out, source.width, source.height, source.nominal_rate) as video,
+            run_.background(video) as sink,
+        ):
+            for frame in annotate(run_.frames(source), records, camera, units):
+                sink.write(frame.image, frame.t)
+
+
+def _summary(results: _Results, run_: Run, config: SpeedConfig, folder: Path) -> dict[str, Any]:
+    factor, units = UNITS[config.display.units], config.display.units
+    speeds = np.array(results.speeds) * factor
+    return {
+        "vehicles": len(results.rows),
+        "rejected": len(results.rejected),
+        "units": units,
+        "median": round(float(np.median(speeds)), 2) if len(speeds) else None,
+        "percentile_85": round(float(np.percentile(speeds, 85)), 2) if len(speeds) else None,
+        "frames": run_.counts["frames"],
+        "time_audit": {
+            name: {
+                "frames": audit.frames,
+                "duration_s": round(audit.duration_s, 3),
+                "dropped": audit.dropped,
+                "irregular": audit.irregular,
+                "duplicated": audit.duplicated,
+                "lost": audit.lost,
+            }
+            for name, audit in results.audits.items()
+        },
+        "out": str(folder),
+    }
+
+
+def text(result: RunResult) -> str:
+    """The summary for people."""
+    summary = result.summary
+    lines = [f"{'vehicles':<12} {summary['vehicles']}"]
+    if summary["vehicles"]:
+        lines += [
+            f"{'median':<12} {summary['median']:.1f} {summary['units']}",
+            f"{'85th perc.':<12} {summary['percentile_85']:.1f} {summary['units']}",
+        ]
+    lines.append(f"{'rejected':<12} {summary['rejected']} (reasons in rejected.csv)")
+    for name, audit in summary["time_audit"].items():
+        lines.append(
+            f"{'times':<12} {name}: {audit['frames']} frames over {audit['duration_s']:.2f} s, {audit['dropped']} dropped, "
+            f"{audit['irregular']} irregular, {audit['duplicated']} duplicated, {audit['lost']} lost"
+        )
+    lines.append(f"{'results':<12} {summary['out']}")
+    return "\n".join(lines)

@@ -6,9 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from visfuse_cli.maths.assignment import assign
 from visfuse_cli.records import Array, Region
 from visfuse_cli.vision import regions as region_tools
-from visfuse_cli.vision.wireframe import DIRECTIONS
+from visfuse_cli.vision.wireframe import DIRECTIONS, FAN
 
 INSIDE = 0.6  # share of a region inside a predicted box that makes it a part of that thing
 COVERED = 0.5  # share of a predicted box under one region that makes the thing a part of that region
@@ -27,6 +28,12 @@ def boxes_of(reach: Array) -> Array:
     """Upright boxes [x0, y0, x1, y1] (N, 4) of tangents (N, K)."""
     quarter = DIRECTIONS // 4
     return np.stack([-reach[:, 2 * quarter], -reach[:, 3 * quarter], reach[:, 0], reach[:, quarter]], axis=1)
+
+
+def reach_of(boxes: Array) -> Array:
+    """Tangents (N, K) of upright boxes [x0, y0, x1, y1] (N, 4)."""
+    corners = boxes[:, [[0, 1], [2, 1], [0, 3], [2, 3]]]
+    return np.asarray(np.max(corners @ FAN.T, axis=1))
 
 
 def overlap(first: Array, second: Array) -> tuple[Array, Array, Array]:
@@ -57,26 +64,25 @@ def claim(regions: list[Region], reach: Array) -> tuple[list[Claim | None], np.n
         return claims, taken
     iou, inside, covered = overlap(region_boxes(regions), boxes_of(reach))
     taken = np.any((inside >= 0.3) | (covered >= COVERED), axis=1)
-    belongs = (inside >= INSIDE) | (covered >= COVERED) | (iou >= 0.2)
-    shared_by = covered >= COVERED
+    shared = np.sum(covered >= COVERED, axis=1) > 1
+    belongs = ((inside >= INSIDE) | (covered >= COVERED) | (iou >= 0.2)) & ~shared[:, None]
     parts: list[list[int]] = [[] for _ in reach]
-    sharing: dict[int, list[int]] = {}
-    for r in map(int, np.flatnonzero(belongs.any(axis=1))):
-        together = [int(thing) for thing in np.flatnonzero(shared_by[r])]
-        if len(together) > 1:
-            sharing[r] = together
-        else:
-            parts[int(np.argmax(np.where(belongs[r], iou[r], -1)))].append(r)
+    pairs, loose, _ = assign(np.where(belongs, 1 - iou, np.inf))
+    for r, thing in pairs:
+        parts[thing].append(int(r))
+    for r in loose:  # fragments
+        thing = int(np.argmax(inside[r]))
+        if inside[r, thing] >= INSIDE and not shared[r]:
+            parts[thing].append(int(r))
     everywhere = np.ones(DIRECTIONS, dtype=bool)
     for thing, members in enumerate(parts):
         if members:
-            best = max(members, key=lambda r: iou[r, thing])
-            kept = [r for r in members if r == best or inside[r, thing] >= INSIDE]
-            claims[thing] = Claim(region_tools.joined([regions[r] for r in kept]), everywhere)
-    for r, together in sharing.items():
+            claims[thing] = Claim(region_tools.joined([regions[r] for r in members]), everywhere)
+    for r in np.flatnonzero(shared):
+        together = np.flatnonzero(covered[r] >= COVERED)
         for thing in together:
             if claims[thing] is None:
-                others = np.max(reach[[other for other in together if other != thing]], axis=0)
+                others = np.max(reach[together[together != thing]], axis=0)
                 claims[thing] = Claim(regions[r], reach[thing] > others + OWN_PX)
     return claims, taken
 

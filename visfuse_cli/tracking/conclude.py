@@ -33,6 +33,7 @@ class Path:
     frame: np.ndarray
     t: Array
     measured: np.ndarray
+    whole: np.ndarray  # measured with the whole outline in view
     planar: Gaussian
     pose_cov: Array
     heading: Array
@@ -75,12 +76,15 @@ def conclude(track: Track, camera: GroundCamera, settings: TrackerSettings, dyna
     pose_cov = symmetrise(J @ belief.cov @ np.swapaxes(J, -1, -2))
     calibration, pixel = _calibration(camera, planar)
     cov = symmetrise(pose_cov + calibration @ camera.ground.cov @ np.swapaxes(calibration, -1, -2))
+    measured = np.array([step.innovation is not None for step in steps])
+    measured[0] = True
     return Path(
         id=track.id,
         class_name=class_name,
         frame=np.array([s.frame for s in samples]),
         t=np.array([s.t for s in samples]),
-        measured=np.array([step.innovation is not None for step in steps]) | (np.arange(len(steps)) == 0),
+        measured=measured,
+        whole=measured & np.array([s.whole for s in samples]),
         planar=Gaussian(planar, cov),
         pose_cov=pose_cov,
         heading=dynamics.heading(belief.mean),

@@ -7,13 +7,13 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from visfuse_cli.maths import homography
-from visfuse_cli.maths.assignment import assign, gate_size
+from visfuse_cli.maths.assignment import gate_size
 from visfuse_cli.maths.cameras import ground_scale, project
 from visfuse_cli.maths.gaussian import mahalanobis
 from visfuse_cli.records import Array, GroundCamera, Region
 from visfuse_cli.tracking import dynamics as dynamics_tools
 from visfuse_cli.tracking import measure
-from visfuse_cli.tracking.association import Claim, boxes_of, claim, footprint_contains, overlap, region_boxes
+from visfuse_cli.tracking.association import Claim, boxes_of, claim, footprint_contains, reach_of, region_boxes
 from visfuse_cli.tracking.dynamics import Dynamics, Prediction, Step
 from visfuse_cli.tracking.settings import SizePrior, TrackerSettings
 from visfuse_cli.vision import wireframe
@@ -22,12 +22,14 @@ from visfuse_cli.vision.wireframe import DIRECTIONS, FAN, Outlines
 
 @dataclass(slots=True)
 class Sample:
-    """One frame of a target: tangents (K,) of its region and which of them count; `measured` when they were used."""
+    """One frame of a target: tangents (K,) of its region, which of them count, whether the whole region was in view
+    and its own; `measured` when they were used."""
 
     frame: int
     t: float
     support: Array
     valid: np.ndarray
+    whole: bool
     measured: bool
 
 
@@ -139,10 +141,11 @@ class GroundTracker:
         if own is not None:
             valid = valid & own
         border = 0.0 if self._upright else self.settings.pose.border_px
-        return Sample(frame, self._t, support + border, valid, True)
+        whole = not region.at_border.any() and (own is None or bool(own.all()))
+        return Sample(frame, self._t, support + border, valid, whole, True)
 
     def _unseen(self, frame: int) -> Sample:
-        return Sample(frame, self._t, np.zeros(DIRECTIONS), np.zeros(DIRECTIONS, bool), False)
+        return Sample(frame, self._t, np.zeros(DIRECTIONS), np.zeros(DIRECTIONS, bool), False, False)
 
     def _measure(self, frame: int, claims: list[Claim | None]) -> None:
         if not claims:
@@ -184,25 +187,21 @@ class GroundTracker:
         track.size_sigma = np.maximum(track.size_sigma * np.sqrt(1 - gain), 0.03)
 
     def _feed_candidates(self, frame: int, regions: list[Region]) -> None:
-        boxes = region_boxes(regions)
-        expected = np.array(
-            [c.box + np.tile(c.drift * (self._t - c.samples[-1].t), 2) for c in self.candidates]
-        ).reshape(-1, 4)
-        iou, _, _ = overlap(expected, boxes)
-        pairs, _, new = assign(np.where(iou > 0.05, 1 - iou, np.inf))
-        seen = set()
-        for c, r in pairs:
-            self._extend(self.candidates[c], frame, regions[r], boxes[r])
-            seen.add(c)
-        for index, candidate in enumerate(self.candidates):
-            if index not in seen and candidate.missed_since is None:
+        drifted = [c.box + np.tile(c.drift * (self._t - c.samples[-1].t), 2) for c in self.candidates]
+        claims, taken = claim(regions, reach_of(np.array(drifted).reshape(-1, 4)))
+        for candidate, claimed in zip(self.candidates, claims, strict=True):
+            if claimed is not None and claimed.own.all():
+                self._extend(candidate, frame, claimed.region)
+            elif candidate.missed_since is None:
                 candidate.missed_since = self._t
-        for r in new:
-            fresh = Candidate([], [], boxes[r])
-            self._extend(fresh, frame, regions[r], boxes[r])
-            self.candidates.append(fresh)
+        for region, is_taken in zip(regions, taken, strict=True):
+            if not is_taken:
+                fresh = Candidate([], [], region_boxes([region])[0])
+                self._extend(fresh, frame, region)
+                self.candidates.append(fresh)
 
-    def _extend(self, candidate: Candidate, frame: int, region: Region, box: Array) -> None:
+    def _extend(self, candidate: Candidate, frame: int, region: Region) -> None:
+        box = region_boxes([region])[0]
         if candidate.samples:
             dt = self._t - candidate.samples[-1].t
             moved = (box - candidate.box).reshape(2, 2).mean(axis=0) / max(dt, 1e-6)

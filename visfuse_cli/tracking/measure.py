@@ -32,7 +32,14 @@ def fit_poses(
     count = len(pose)
     pose_sigma = np.tile([POSITION_SIGMA, POSITION_SIGMA, heading_sigma], (count, 1))
     size, size_sigma = (np.broadcast_to(a, (count, 3)) for a in (size, size_sigma))
-    return wireframe.fit(camera, outlines, pose, pose_sigma, size, size_sigma, settings.sigma_px)
+    sigma_px = settings.sigma_px + settings.sigma_share * extent(outlines)
+    return wireframe.fit(camera, outlines, pose, pose_sigma, size, size_sigma, sigma_px)
+
+
+def extent(outlines: Outlines) -> Array:
+    """Mean width of N outlines over all directions (N,) px."""
+    half = outlines.support.shape[1] // 2
+    return np.asarray(np.mean(outlines.support[:, :half] + outlines.support[:, half:], axis=1))
 
 
 def measurement(fit: BoxFit, index: int, predicted: Array, heading_sigma: float = HEADING_SIGMA) -> tuple[Array, Array]:
@@ -58,8 +65,9 @@ def classify(
         mean, sigma = prior_arrays(prior)
         fit = fit_poses(camera, outlines, pose, mean, sigma, settings, 0.12)
         size, size_sigma = common_size(fit, mean, sigma)
-        misfit = np.median(fit.rms[fit.ok]) / settings.sigma_px if fit.ok.any() else np.inf
-        cost = float(12 * misfit**2 + np.sum(((size - mean) / sigma) ** 2 + 2 * np.log(sigma)))
+        relative = fit.rms / (settings.sigma_px + settings.sigma_share * extent(outlines))
+        misfit = float(np.median(relative[fit.ok])) if fit.ok.any() else np.inf
+        cost = 12 * misfit**2 + float(np.sum(((size - mean) / sigma) ** 2 + 2 * np.log(sigma)))
         if best is None or cost < best[0]:
             best = cost, prior, size, size_sigma, fit
     assert best is not None

@@ -27,8 +27,8 @@ class SizePrior(Section):
 
 
 VEHICLES = (
-    SizePrior(name="car", length=(4.4, 0.45), width=(1.8, 0.12), height=(1.52, 0.14)),
-    SizePrior(name="van", length=(5.4, 0.6), width=(2.0, 0.15), height=(2.3, 0.3)),
+    SizePrior(name="car", length=(4.2, 0.7), width=(1.8, 0.15), height=(1.5, 0.15)),
+    SizePrior(name="van", length=(5.2, 0.8), width=(2.0, 0.15), height=(2.2, 0.3)),
     SizePrior(name="truck", length=(9.5, 2.2), width=(2.5, 0.2), height=(3.3, 0.5)),
     SizePrior(name="two-wheeler", length=(2.0, 0.25), width=(0.75, 0.15), height=(1.6, 0.2)),
 )
@@ -51,6 +51,9 @@ class PoseSettings(Section):
     """How well a box sits on a region."""
 
     sigma_px: float = Field(1.5, gt=0, le=50, description="px: noise of a region's tangent")
+    sigma_share: float = Field(
+        0.02, ge=0, le=1, description="noise of a tangent that grows with the outline, as a share of its width"
+    )
     bias_px: float = Field(
         0.3, ge=0, le=20, description="px: outline error that stays over a vehicle's life; widens the speed interval"
     )

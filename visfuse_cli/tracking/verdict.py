@@ -66,7 +66,10 @@ def _best_stretch(
     path: Path, length: Array, tangent: Array, entry_cov: Array, bias_px: float, settings: SpeedSettings
 ) -> tuple[int, int, float]:
     """First and last state, and the deviation of the mean speed between them (m/s)."""
-    seen = np.flatnonzero(path.measured)
+    # A vehicle cut off by the frame's edge is placed by its supposed size: good to follow it, not to time it.
+    seen = np.flatnonzero(path.whole)
+    if len(seen) < settings.min_frames:
+        seen = np.flatnonzero(path.measured)
     grid = np.unique(seen[np.linspace(0, len(seen) - 1, min(len(seen), 48)).astype(int)])
     i, j = (index.ravel() for index in np.meshgrid(grid, grid, indexing="ij"))
     duration, distance = path.t[j] - path.t[i], length[j] - length[i]
@@ -94,11 +97,7 @@ def _reason(path: Path, verdict: Verdict, settings: SpeedSettings) -> str:
     """Why this track gets no speed; empty when it does. Nothing is clamped: a track is believed or rejected."""
     duration = path.t[verdict.last] - path.t[verdict.first]
     frames = int(path.measured[verdict.first : verdict.last + 1].sum())
-    speed = np.linalg.norm(path.planar.mean[:, 2:], axis=1)
-    spacing = np.maximum(np.diff(path.t), 1e-6)
-    # Over a third of a second, so that one frame's noise is not taken for a jump.
-    reach = max(1, round(0.3 / float(np.median(spacing)))) if len(spacing) else 1
-    change = np.abs(speed[reach:] - speed[:-reach]) / np.maximum(path.t[reach:] - path.t[:-reach], 1e-6)
+    excess = _jump(path, verdict)
     refused = path.refused / max(1, path.refused + int(path.measured.sum()))
     if path.ended_by.startswith("same vehicle"):
         return path.ended_by
@@ -106,8 +105,8 @@ def _reason(path: Path, verdict: Verdict, settings: SpeedSettings) -> str:
         return f"too short: {frames} measured frames over {duration:.2f} s"
     if verdict.distance < settings.min_distance_m:
         return f"hardly moved: {verdict.distance:.1f} m"
-    if len(change) and float(change.max()) > settings.max_acceleration:
-        return f"jump: speed changes by {change.max():.0f} m/s^2"
+    if excess > settings.max_acceleration:
+        return f"jump: speed changes by more than {excess:.0f} m/s^2"
     if refused > settings.max_refused:
         return f"inconsistent: {100 * refused:.0f} % of the measurements outside the gate"
     outline = _outline_px(path)
@@ -116,6 +115,19 @@ def _reason(path: Path, verdict: Verdict, settings: SpeedSettings) -> str:
     if verdict.sigma > settings.max_sigma * abs(verdict.speed):
         return f"too uncertain: {verdict.speed * 3.6:.0f} +- {verdict.sigma * Z95 * 3.6:.0f} km/h, outside the trusted zone"
     return ""
+
+
+def _jump(path: Path, verdict: Verdict) -> float:
+    """The largest change of speed (m/s^2) on the stretch that its uncertainty does not explain, over a third of a second."""
+    stretch = slice(verdict.first, verdict.last + 1)
+    t, velocity = path.t[stretch], path.planar.mean[stretch, 2:]
+    speed = np.linalg.norm(velocity, axis=1)
+    sigma = np.sqrt(np.trace(path.planar.cov[stretch, 2:, 2:], axis1=1, axis2=2))
+    if len(t) < 3:
+        return 0.0
+    reach = max(1, round(0.3 / float(np.median(np.diff(t)))))
+    change = np.abs(speed[reach:] - speed[:-reach]) - 2 * (sigma[reach:] + sigma[:-reach])
+    return float(np.max(change / (t[reach:] - t[:-reach]), initial=0.0))
 
 
 def _outline_px(path: Path) -> float:

@@ -10,16 +10,21 @@ import numpy as np
 from visfuse_cli.records import Array, Image
 
 FOREGROUND, SHADOW = 255, 127
+BINS = 64  # of the ratio of a pixel to the background, from 0 to 1
+SHADOW_REACH = 5  # bins either side of the shadows' own ratio: sensor noise and texture
+SHADOW_SHARE = 0.6  # of all shadow pixels that must lie within reach before the rest is called paint
+SHADOW_MEMORY = 0.995  # a frame: clouds come and go
+LEARN_EVERY = 4  # frames: learning costs as much as looking
 
 
 class Background:
     """OpenCV's MOG2 or KNN model with looking and learning apart (Lou 2002, sec. 2, motion detection).
 
-    `horizon_s` is the memory in seconds; every `learn_every`-th frame is learnt, with the pixels of live tracks
-    replaced by the background itself, so that a car that waits at a light does not dissolve into the road.
+    Every few frames one is learnt, with the pixels of live tracks replaced by the background itself, so that a car
+    that waits at a light does not dissolve into the road.
     """
 
-    def __init__(self, kind: str, threshold: float, shadow_ratio: float, learn_every: int) -> None:
+    def __init__(self, kind: str, threshold: float, shadow_ratio: float) -> None:
         if kind == "mog2":
             model = cv2.createBackgroundSubtractorMOG2(500, threshold, True)
         else:
@@ -27,9 +32,10 @@ class Background:
         model.setShadowValue(SHADOW)
         model.setShadowThreshold(shadow_ratio)
         self._model = model
-        self._learn_every = learn_every
-        self._seen = 0
+        self._waiting = 0  # frames since the last one that was learnt
+        self._share = 0.0
         self._picture: Image | None = None
+        self._shadows = _ShadowDepth()
 
     def start(self, picture: Image) -> None:
         """Begin from a picture (H, W, 3) of the empty scene."""
@@ -38,14 +44,18 @@ class Background:
 
     def detect(self, image: Image) -> Image:
         """Label each pixel of `image` (H, W, 3): 255 foreground, 127 shadow, 0 background, without learning it."""
-        return np.asarray(self._model.apply(image, learningRate=0.0), dtype=np.uint8)
+        labels = np.asarray(self._model.apply(image, learningRate=0.0), dtype=np.uint8)
+        if self._picture is not None:
+            self._shadows.relabel(labels, image, self._picture)
+        return labels
 
     def learn(self, image: Image, rate: float, followed: Iterable[Array]) -> None:
         """Adapt to `image` by `rate` (share a frame) except inside the followed outlines (k, 2) px."""
-        self._seen += 1
-        if self._picture is None or self._seen % self._learn_every:
+        self._waiting += 1
+        self._share += rate
+        if self._picture is None or self._waiting < LEARN_EVERY:
             return
-        rate = 1 - (1 - rate) ** self._learn_every
+        rate, self._waiting, self._share = min(self._share, 1.0), 0, 0.0
         hulls = [np.round(hull).astype(np.int32) for hull in followed]
         if hulls:
             mask = np.zeros(image.shape[:2], np.uint8)
@@ -55,6 +65,30 @@ class Background:
             cv2.copyTo(self._picture, mask, image)
         self._model.apply(image, learningRate=rate)
         self._picture = cv2.addWeighted(image, max(rate, 1 / 64), self._picture, 1 - max(rate, 1 / 64), 0)
+
+
+class _ShadowDepth:
+    """How dark this recording's shadows are: all cast by one sun, they share one ratio to the lit ground.
+
+    Where most of what the model calls shadow lies in a narrow band of ratios, the rest of it is grey paint.
+    """
+
+    def __init__(self) -> None:
+        self._histogram = np.zeros(BINS)
+
+    def relabel(self, labels: Image, image: Image, picture: Image) -> None:
+        """Turn `labels` from shadow to foreground where the darkening is not the shadows' own."""
+        at = np.nonzero(labels == SHADOW)
+        if not len(at[0]):
+            return
+        lit = np.maximum(picture[at].sum(axis=1, dtype=np.int32), 1)
+        level = np.minimum(image[at].sum(axis=1, dtype=np.int32) * BINS // lit, BINS - 1)
+        self._histogram = SHADOW_MEMORY * self._histogram + np.bincount(level, minlength=BINS)
+        near = np.convolve(self._histogram, np.ones(2 * SHADOW_REACH + 1), mode="same")
+        peak = int(np.argmax(near))
+        if near[peak] > SHADOW_SHARE * self._histogram.sum():
+            other = np.abs(level - peak) > SHADOW_REACH
+            labels[at[0][other], at[1][other]] = FOREGROUND
 
 
 def median_picture(images: Iterable[Image]) -> Image:

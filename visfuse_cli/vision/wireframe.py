@@ -86,18 +86,19 @@ def fit(
     pose_sigma: Array,
     size: Array,
     size_sigma: Array,
-    sigma_px: float = 1.0,
+    sigma_px: Array,
     iterations: int = 6,
 ) -> BoxFit:
     """Fit N boxes to N outlines by Gauss-Newton from `pose` (N, 3) and `size` (N, 3).
 
     pose_sigma, size_sigma (N, 3) are the priors' deviations (inf: none); the prior on x, y is normally none, that on
-    theta the predicted heading's. Lou 2002, sec. 2 and 4.1.
+    theta the predicted heading's; sigma_px (N,) is the noise of each outline's tangents. Lou 2002, sec. 2 and 4.1.
     """
     prior = np.concatenate([pose, size], axis=1)
     weight = 1 / np.concatenate([pose_sigma, size_sigma], axis=1) ** 2
     x = prior.copy()
     valid = outlines.valid
+    noise = np.asarray(sigma_px, dtype=float)[:, None]
     rows = np.arange(len(x))[:, None]
     N = np.tile(np.eye(6), (len(x), 1, 1))
     residual = np.zeros_like(outlines.support)
@@ -109,7 +110,7 @@ def fit(
         J = np.nan_to_num(np.einsum("ndkp,dk->ndp", J_corner[rows, active], FAN))
         residual = np.nan_to_num(outlines.support - np.take_along_axis(reach, active[:, None], axis=1)[:, 0])
         # A Cauchy weight: a mirror, a patch of shadow or a missing corner moves one tangent, not the box.
-        robust = valid / (1 + (residual / (3 * sigma_px)) ** 2) / sigma_px**2
+        robust = valid / (1 + (residual / (3 * noise)) ** 2) / noise**2
         N = np.einsum("nd,ndp,ndq->npq", robust, J, J) + weight[:, :, None] * np.eye(6)
         N += 1e-9 * np.trace(N, axis1=1, axis2=2)[:, None, None] * np.eye(6)
         gradient = np.einsum("nd,ndp,nd->np", robust, J, residual) + weight * (prior - x)

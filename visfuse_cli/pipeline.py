@@ -1,0 +1,248 @@
+"""The shared core of every command: frames by time, stop requests, work that overlaps, stage times, warnings."""
+
+from __future__ import annotations
+
+import queue
+import signal
+import sys
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
+from dataclasses import replace
+from datetime import UTC, datetime
+from types import FrameType, TracebackType
+from typing import Any, Protocol, TypeVar
+
+from tqdm import tqdm
+
+from visfuse_cli.files.video import VideoSource
+from visfuse_cli.records import Frame, FrameSet
+
+T = TypeVar("T")
+AHEAD = 3  # pictures that wait between two threads: enough to even out, too few to fill memory
+STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
+
+class Sink(Protocol):
+    """Anything that takes one thing after another, like a VideoWriter."""
+
+    def write(self, *values: Any) -> None: ...
+
+
+class Run:
+    """`with Run(progress=True) as run:` is one run of a command.
+
+    The first SIGINT or SIGTERM ends the stream of frames after the current one and is kept in `stopped_by`, so that
+    the command finishes its files; a second one kills. Results do not depend on the threads used here: they keep order.
+    """
+
+    def __init__(self, progress: bool = False) -> None:
+        self.progress = progress and sys.stderr.isatty()
+        self.stopped_by: int | None = None
+        self.started = datetime.now(UTC)
+        self.stages: dict[str, float] = {}  # seconds by name
+        self.counts: Counter[str] = Counter()
+        self._warnings: dict[str, None] = {}  # an ordered set
+        self._handlers: dict[int, Any] = {}
+
+    def __enter__(self) -> Run:
+        if threading.current_thread() is threading.main_thread():
+            self._handlers = {number: signal.signal(number, self._stop) for number in STOP_SIGNALS}
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, problem: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        for number, handler in self._handlers.items():
+            signal.signal(number, handler)
+        self._handlers = {}
+
+    def _stop(self, number: int, frame: FrameType | None) -> None:
+        self.stopped_by = number
+        for each in STOP_SIGNALS:
+            signal.signal(each, signal.SIG_DFL)
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What was warned of, each text once."""
+        return tuple(self._warnings)
+
+    def warn(self, text: str) -> None:
+        """Keep a warning for run.json and the terminal."""
+        self._warnings[text] = None
+
+    def count(self, name: str, n: int = 1) -> None:
+        """Add to a count of run.json."""
+        self.counts[name] += n
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        """Add the wall time of the block to a stage of run.json."""
+        begun = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.stages[name] = self.stages.get(name, 0.0) + time.perf_counter() - begun
+
+    def frames(self, source: VideoSource, total: int | None = None) -> Iterator[Frame]:
+        """The frames of one clip, decoded ahead in a thread, until they end or the run is stopped."""
+        with ahead(source.frames) as frames, self._bar(source.frame_count if total is None else total) as bar:
+            for frame in self._waited(frames):
+                yield frame
+                bar.update()
+                if self.stopped_by is not None:
+                    return
+
+    def synchronise(
+        self, sources: Mapping[str, VideoSource], tolerance_s: float, offsets: Mapping[str, float] | None = None
+    ) -> Iterator[FrameSet]:
+        """Sets of frames by time: the first view leads, each other one adds its nearest frame within `tolerance_s`.
+
+        `offsets` (s by view) are added to a view's own times to reach the shared clock; all times come out on the
+        leading view's. A frame belongs to one set at most: to that whose time is nearest to its own.
+        """
+        leader, *others = sources
+        shift = {view: (offsets or {}).get(view, 0.0) - (offsets or {}).get(leader, 0.0) for view in sources}
+        with ExitStack() as stack:
+            streams = {view: stack.enter_context(ahead(source.frames)) for view, source in sources.items()}
+            cursors = {view: _Cursor(self._waited(streams[view]), shift[view]) for view in others}
+            bar = stack.enter_context(self._bar(sources[leader].frame_count))
+            leading = self._waited(streams[leader])
+            frame = next(leading, None)
+            while frame is not None and self.stopped_by is None:
+                following = next(leading, None)
+                found = {leader: frame}
+                for view, cursor in cursors.items():
+                    match = cursor.nearest(frame.t, tolerance_s, None if following is None else following.t)
+                    if match is not None:
+                        found[view] = match
+                yield FrameSet(frame.t, found, tuple(view for view in others if view not in found))
+                bar.update()
+                frame = following
+
+    @contextmanager
+    def background(self, sink: Sink) -> Iterator[Sink]:
+        """Let `sink.write` run in a thread, in order, a few pictures behind; its error is raised here.
+
+        What is handed over must not be changed afterwards. Closing the sink stays with its owner, after this block.
+        """
+        writer = _BackgroundWriter(sink)
+        try:
+            yield writer
+        except BaseException:
+            writer.finish(discard=True)
+            raise
+        with self.stage("write"):
+            writer.finish(discard=False)
+
+    def _waited(self, items: Iterator[T]) -> Iterator[T]:
+        """The same items; waiting for them is the stage `decode`."""
+        while True:
+            with self.stage("decode"):
+                item = next(items, None)
+            if item is None:
+                return
+            yield item
+
+    def _bar(self, total: int | None) -> Any:
+        return tqdm(total=total, unit=" frames", file=sys.stderr, disable=not self.progress, leave=False)
+
+
+class _Cursor:
+    """Walks one view's frames, on the leading view's clock, along rising times; holds two of them."""
+
+    def __init__(self, frames: Iterator[Frame], shift: float) -> None:
+        self._frames = (replace(frame, t=frame.t + shift) for frame in frames)
+        self._before: Frame | None = None
+        self._after = next(self._frames, None)
+
+    def nearest(self, t: float, tolerance_s: float, following: float | None) -> Frame | None:
+        """The frame nearest to `t`, unless it is too far off or nearer to the leading view's following frame."""
+        while self._after is not None and self._after.t <= t:
+            self._before, self._after = self._after, next(self._frames, None)
+        candidates = [frame for frame in (self._before, self._after) if frame is not None]
+        best = min(candidates, key=lambda frame: abs(frame.t - t), default=None)
+        if best is None or abs(best.t - t) > tolerance_s:
+            return None
+        if following is not None and abs(best.t - following) < abs(best.t - t):
+            return None
+        if best is self._before:
+            self._before = None
+        else:
+            self._after = next(self._frames, None)
+        return best
+
+
+class _BackgroundWriter:
+    def __init__(self, sink: Sink) -> None:
+        self._sink = sink
+        self._queue: queue.Queue[tuple[Any, ...] | None] = queue.Queue(AHEAD)
+        self._problem: BaseException | None = None
+        self._discard = False
+        self._thread = threading.Thread(target=self._work, name="visfuse-write", daemon=True)
+        self._thread.start()
+
+    def write(self, *values: Any) -> None:
+        if self._problem is not None:
+            raise self._problem
+        self._queue.put(values)
+
+    def finish(self, discard: bool) -> None:
+        self._discard = discard
+        self._queue.put(None)
+        self._thread.join()
+        if self._problem is not None and not discard:
+            raise self._problem
+
+    def _work(self) -> None:
+        while (values := self._queue.get()) is not None:
+            if self._problem is None and not self._discard:
+                try:
+                    self._sink.write(*values)
+                except BaseException as problem:
+                    self._problem = problem  # raised by the next `write`, or by `finish`
+
+
+@contextmanager
+def ahead(produce: Callable[[], Iterator[T]], limit: int = AHEAD) -> Iterator[Iterator[T]]:
+    """Run a generator in a thread of its own, at most `limit` items ahead; its exception is raised in the consumer.
+
+    The whole generator lives in that thread, decoders included; leaving the block ends and joins it.
+    """
+    items: queue.Queue[tuple[T | None, BaseException | None]] = queue.Queue(limit)
+    stopped = threading.Event()
+
+    def work() -> None:
+        problem: BaseException | None = None
+        try:
+            for item in produce():
+                items.put((item, None))
+                if stopped.is_set():
+                    return
+        except BaseException as raised:
+            problem = raised
+        items.put((None, problem))
+
+    def consume() -> Iterator[T]:
+        while True:
+            item, problem = items.get()
+            if problem is not None:
+                raise problem
+            if item is None:
+                return
+            yield item
+
+    thread = threading.Thread(target=work, name="visfuse-decode", daemon=True)
+    thread.start()
+    try:
+        yield consume()
+    finally:
+        stopped.set()
+        while thread.is_alive():  # a full queue holds the thread: empty it
+            try:
+                items.get(timeout=0.05)
+            except queue.Empty:
+                thread.join(0.01)
+        thread.join()
