@@ -14,10 +14,15 @@ def pictures(n, width=64, height=48, seed=0):
     rng = np.random.default_rng(seed)
     corner = rng.integers(30, 200, (n, 3))
     ramp = np.linspace(0, 50, width)[None, :, None] + np.linspace(0, 20, height)[:, None, None]
-    return [(np.ones((height, width, 1)) * c + ramp * (1 + k % 3) / 3).clip(0, 255).astype(np.uint8) for k, c in enumerate(corner)]
+    return [
+        (np.ones((height, width, 1)) * c + ramp * (1 + k % 3) / 3).clip(0, 255).astype(np.uint8)
+        for k, c in enumerate(corner)
+    ]
 
 
-def write_clip(path: Path, stamps, images=None, tick=Fraction(1, 90000), codec="libx264", pix_fmt="yuv420p", **stream_options):
+def write_clip(
+    path: Path, stamps, images=None, tick=Fraction(1, 90000), codec="libx264", pix_fmt="yuv420p", **stream_options
+):
     """A clip whose pictures carry exactly these stamps (ticks); the container is told by the name."""
     images = images or pictures(len(stamps))
     height, width = images[0].shape[:2]

@@ -63,7 +63,9 @@ def _main(
         bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")
     ] = False,
     quiet: QuietOption = False,
-    verbose: Annotated[bool, typer.Option("-v", "--verbose", help="Print warnings in full and times per stage.")] = False,
+    verbose: Annotated[
+        bool, typer.Option("-v", "--verbose", help="Print warnings in full and times per stage.")
+    ] = False,
 ) -> None:
     global _quiet, _verbose
     _quiet, _verbose = quiet, verbose
@@ -72,7 +74,9 @@ def _main(
 @app.command("calibrate-homography")
 def calibrate_homography(
     out: Annotated[Path, typer.Option("--out", metavar="H.json", help="The homography to write.")],
-    points: Annotated[Path | None, typer.Option("--points", metavar="F", help="CSV u,v,X,Y: four or more points.")] = None,
+    points: Annotated[
+        Path | None, typer.Option("--points", metavar="F", help="CSV u,v,X,Y: four or more points.")
+    ] = None,
     lines: Annotated[
         Path | None, typer.Option("--lines", metavar="F", help="CSV u1,v1,u2,v2,X1,Y1,X2,Y2: four or more lines.")
     ] = None,
@@ -82,7 +86,9 @@ def calibrate_homography(
     image: Annotated[
         Path | None, typer.Option("--image", metavar="F", help="A frame or clip: draws the picture beside H.json.")
     ] = None,
-    size: Annotated[str | None, typer.Option("--size", metavar="WxH", help="Image size where there is no --image.")] = None,
+    size: Annotated[
+        str | None, typer.Option("--size", metavar="WxH", help="Image size where there is no --image.")
+    ] = None,
     camera: Annotated[
         Path | None, typer.Option("--camera", metavar="F", help="Lens: calibration.yaml with M1 and D1.")
     ] = None,
@@ -123,7 +129,8 @@ def speed(
     ],
     out: OutOption,
     detections: Annotated[
-        Path | None, typer.Option("--detections", metavar="F", help="MOTChallenge boxes instead of background subtraction.")
+        Path | None,
+        typer.Option("--detections", metavar="F", help="MOTChallenge boxes instead of background subtraction."),
     ] = None,
     config: ConfigOption = None,
     set_: SetOption = None,

@@ -120,7 +120,9 @@ def run(request: RunRequest) -> RunResult:
     several = is_clip_folder(request.input)
     clips = list_clips(request.input) if several else [request.input]
     boxes = _boxes(request.options.get("detections"), several)
-    inputs = [describe(path) for path in (*clips, request.options["homography"], request.options.get("detections")) if path]
+    inputs = [
+        describe(path) for path in (*clips, request.options["homography"], request.options.get("detections")) if path
+    ]
     for path in clips:
         with _open(path, request) as source:
             _check_size(source, ground, path)

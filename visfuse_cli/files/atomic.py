@@ -22,7 +22,6 @@ def failing_as_output(path: Path) -> Iterator[None]:
     try:
         yield
     except OSError as problem:
-        # An OSError that names another file is somebody else's: a source read while this file was being written.
         raise OutputError(f"{path}: cannot be written: {problem.strerror or problem}") from problem
 
 

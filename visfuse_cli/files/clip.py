@@ -18,7 +18,7 @@ from av.format import Flags
 from av.stream import Disposition
 
 from visfuse_cli.errors import InputError
-from visfuse_cli.files.timing import TimeAuditor
+from visfuse_cli.files.timing import TimeAuditor, plural
 from visfuse_cli.records import Image
 
 # Silence, not a level: PyAV's log callback waits for the GIL in decoder threads, and closing a decoder deadlocks on it.
@@ -83,10 +83,10 @@ class Clip:
                 interlaced += bool(frame.interlaced_frame)
                 yield index, t, _picture(frame, buffers[index % 2], self._turn)
         if damaged:
-            auditor.warn(f"{damaged} pictures are damaged")
+            auditor.warn(f"{plural(damaged, 'frame')} damaged in part")
         if interlaced:
-            auditor.warn(f"{interlaced} frames are interlaced: their odd and even rows are of two instants")
-        auditor.lost += self._lost(index + 1, t, longest, auditor.decode_errors)
+            auditor.warn(f"{plural(interlaced, 'frame')} interlaced: odd and even rows show two instants")
+        self._note_losses(auditor, index + 1, t, longest)
 
     def _time(self, frame: av.VideoFrame, index: int, before: float) -> float:
         """Seconds since the first stamp; a frame without one follows the frame before by the stated interval."""
@@ -118,16 +118,16 @@ class Clip:
         height, width = self._shape
         return np.empty((height * 3 // 2, width), np.uint8)
 
-    def _lost(self, decoded: int, last: float, longest: float, errors: int) -> int:
+    def _note_losses(self, auditor: TimeAuditor, decoded: int, last: float, longest: float) -> None:
         """Frames announced but not there; an edit list may announce too many, so only where something is amiss."""
         interval = float(self._interval)
-        missing = (self._end_s or 0.0) - (last + interval)
-        cut_short = missing > 1.5 * max(interval, longest)
-        if not (cut_short or errors):
-            return 0
-        if self._frames:
-            return max(self._frames - decoded, 0)
-        return max(round(missing / interval), errors) if cut_short else errors
+        behind = (self._end_s or 0.0) - (last + interval)
+        tail = max(round(behind / interval), 0) if behind > 1.5 * max(interval, longest) else 0
+        if not (tail or auditor.decode_errors):
+            return
+        lost = max(self._frames - decoded, 0) if self._frames else tail + auditor.decode_errors
+        auditor.lose(min(tail, lost), inside=False)
+        auditor.lose(max(lost - tail, 0), inside=True)
 
     @contextmanager
     def _opened(self) -> Iterator[tuple[Any, av.VideoStream]]:

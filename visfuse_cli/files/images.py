@@ -61,13 +61,13 @@ class ImageFolder:
 
     def pictures(self, auditor: TimeAuditor, start: float) -> Iterator[tuple[int, float, _Picture]]:
         """Every readable image at or after `start`; raises InputError where one has another size."""
-        auditor.lost += self.extra_stamps
+        auditor.lose(self.extra_stamps, inside=False)
         for index, (name, t) in enumerate(zip(self.names, self.stamps, strict=True)):
             if t < start:
                 continue
             image = _load(name)
             if image is None:
-                auditor.lost += 1
+                auditor.lose(1, inside=True)
                 auditor.warn(f"{name.name} cannot be decoded")
                 continue
             height, width = image.shape[:2]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -43,7 +44,8 @@ class TrackSpool:
             if kind is None:
                 self.finish()
         finally:
-            self._file.close()
+            with suppress(OSError):  # nothing is left to write, unless a write was refused and has been reported
+                self._file.close()
             self._partial.unlink(missing_ok=True)
 
     def __len__(self) -> int:

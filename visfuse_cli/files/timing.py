@@ -21,12 +21,18 @@ class TimeAuditor:
         self.duplicated = 0
         self.lost = 0
         self.decode_errors = 0
+        self._lost_inside = 0
         self.warnings: list[str] = []
         self._stamps = array("d")
 
     def add(self, t: float) -> None:
         """Note one frame's time (s)."""
         self._stamps.append(t)
+
+    def lose(self, frames: int, inside: bool) -> None:
+        """Note frames that could not be decoded; those lost inside the clip also leave a gap in the stamps."""
+        self.lost += frames
+        self._lost_inside += frames if inside else 0
 
     def warn(self, text: str) -> None:
         """Note what else is wrong with the clip."""
@@ -44,7 +50,7 @@ class TimeAuditor:
         if np.count_nonzero(np.abs(intervals - nominal) <= slack) * 2 > len(intervals):
             late = np.append(intervals[1:] < nominal - slack, False)  # the next one makes up for it: nothing is missing
             gaps = (intervals > GAP * nominal + self.resolution_s) & ~late[: len(intervals)]
-        dropped = int(np.sum(multiples[gaps] - 1))
+        dropped = max(int(np.sum(multiples[gaps] - 1)) - self._lost_inside, 0)
         explained = gaps & (np.abs(intervals - multiples * nominal) <= slack)
         irregular = int(np.count_nonzero((np.abs(intervals - nominal) > slack) & ~explained))
         return TimeAudit(
@@ -62,16 +68,19 @@ class TimeAuditor:
         found = []
         if dropped:
             first = float(stamps[int(np.argmax(gaps))])
-            found.append(
-                f"{dropped} frames are missing, in {int(gaps.sum())} gaps of the stamps, first at {first:.3f} s"
-            )
+            found.append(f"{plural(dropped, 'frame')} missing in gaps of the time stamps, first at {first:.3f} s")
         if irregular:
-            found.append(f"{irregular} of {len(stamps) - 1} intervals are off the usual one by more than a fifth")
+            found.append(f"{irregular} of {len(stamps) - 1} intervals off the usual one by more than a fifth")
         if self.duplicated:
-            found.append(f"{self.duplicated} frames repeat the one before (equal stamp or equal in every pixel)")
+            found.append(f"{plural(self.duplicated, 'frame')} repeated (equal stamp, or equal in every pixel)")
         if self.lost:
-            found.append(f"{self.lost} frames are lost: the file is truncated or damaged")
+            found.append(f"{plural(self.lost, 'frame')} lost: the file is truncated or damaged")
         return [f"{self.name}: {text}" for text in found]
+
+
+def plural(n: int, noun: str) -> str:
+    """A count and its noun."""
+    return f"{n} {noun}" if n == 1 else f"{n} {noun}s"
 
 
 def _nominal(intervals: Array, resolution_s: float) -> float:

@@ -60,7 +60,7 @@ def fit_points(
     `robust_px` drops points further off than that; None uses all. Raises InputError for fewer than four, equal,
     collinear or nearly degenerate points, or points on both sides of the horizon.
     """
-    to_image, to_world = _scaling(image), _scaling(world)
+    to_image, to_world = scaling(image), scaling(world)
     scaled_image, scaled_world = apply(to_image, image), apply(to_world, world)
 
     def linear(items: NDArray[np.intp]) -> Array:
@@ -68,9 +68,9 @@ def fit_points(
         X = scaled_world[items]
         zero = np.zeros_like(x)
         rows = np.concatenate([np.hstack([x, zero, -X[:, :1] * x]), np.hstack([zero, x, -X[:, 1:] * x])])
-        return np.linalg.inv(to_world) @ _null(rows) @ to_image
+        return np.linalg.inv(to_world) @ null_vector(rows) @ to_image
 
-    return _fit(
+    return fit(
         Problem(
             count=len(image),
             linear=linear,
@@ -86,7 +86,7 @@ def fit_points(
     )
 
 
-def _fit(problem: Problem, noun: str, sigma: float, robust: float | None, condition_limit: float) -> Fit:
+def fit(problem: Problem, noun: str, sigma: float, robust: float | None, condition_limit: float) -> Fit:
     everything = np.arange(problem.count)
     if problem.count < 4:
         raise InputError(f"a homography needs four {noun}s or more, not {problem.count}")
@@ -137,7 +137,7 @@ def _scale(H: Array) -> float:
     return float(normalised(H)[k] / H[k])
 
 
-def _scaling(points: Array) -> Array:
+def scaling(points: Array) -> Array:
     """Hartley's similarity: centroid to the origin, mean distance to sqrt 2."""
     centre = points.mean(axis=0)
     size = np.mean(np.linalg.norm(points - centre, axis=1))
@@ -145,7 +145,8 @@ def _scaling(points: Array) -> Array:
     return np.array([[s, 0, -s * centre[0]], [0, s, -s * centre[1]], [0, 0, 1]])
 
 
-def _null(rows: Array) -> Array:
+def null_vector(rows: Array) -> Array:
+    """The matrix (3, 3) whose entries satisfy rows (m, 9) @ entries = 0 best."""
     H: Array = np.linalg.svd(rows)[2][-1].reshape(3, 3)
     return H
 
@@ -158,7 +159,7 @@ def _basis(H: Array) -> tuple[Array, Array]:
 
 def _refine(problem: Problem, H: Array, items: NDArray[np.intp]) -> Array:
     """Levenberg-Marquardt on the image error, eight parameters around the start at unit norm."""
-    T = _scaling(problem.centre)
+    T = scaling(problem.centre)
     start = H @ np.linalg.inv(T)
     rows = 1 / np.maximum(np.linalg.norm(start, axis=1), 1e-300)
     h, directions = _basis(start * rows[:, None])
@@ -176,7 +177,7 @@ def _refine(problem: Problem, H: Array, items: NDArray[np.intp]) -> Array:
 
 def _covariance(problem: Problem, H: Array, items: NDArray[np.intp], sigma: float) -> tuple[Array, float]:
     """Covariance (9, 9) of the entries at the stated scale, and the condition number of the scaled problem."""
-    T = _scaling(problem.centre)
+    T = scaling(problem.centre)
     start = H @ np.linalg.inv(T)
     rows = np.maximum(np.linalg.norm(start, axis=1), 1e-300)
     _, directions = _basis(start / rows[:, None])
