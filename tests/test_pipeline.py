@@ -79,9 +79,13 @@ def test_an_error_while_decoding_reaches_the_consumer():
 
 
 def test_a_consumer_that_fails_leaves_no_thread():
-    with pytest.raises(RuntimeError), Run() as run:
-        for _ in run.frames(Stub("image", range(1000))):
-            raise RuntimeError
+    def consume():
+        with Run() as run:
+            for frame in run.frames(Stub("image", range(1000))):
+                raise RuntimeError(frame.index)
+
+    with pytest.raises(RuntimeError, match="0"):
+        consume()
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
@@ -136,20 +140,23 @@ class Recorder:
         self.seen.append(value)
 
 
+def hand_over(sink, n):
+    with Run() as run, run.background(sink) as out:
+        for k in range(n):
+            out.write(k)
+
+
 def test_background_keeps_order_and_drains():
     sink = Recorder()
-    with Run() as run, run.background(sink) as out:
-        for k in range(50):
-            out.write(k)
+    hand_over(sink, 50)
     assert sink.seen == list(range(50))
 
 
 def test_background_error_reaches_the_caller():
     for last in (3, 200):  # on leaving the block, and while writing
         sink = Recorder(fail_at=3)
-        with pytest.raises(OSError, match="disk full"), Run() as run, run.background(sink) as out:
-            for k in range(last + 1):
-                out.write(k)
+        with pytest.raises(OSError, match="disk full"):
+            hand_over(sink, last + 1)
         assert sink.seen == [0, 1, 2]
 
 

@@ -73,7 +73,7 @@ def test_every_kind_of_footage_keeps_the_same_promises(backend, tmp_path):
         assert again.audit().duplicated == 0
         np.testing.assert_array_equal(next(again.frames()).image, frames[0].image)
 
-    with pytest.raises(InputError, match="ends before 9.0 s"):
+    with pytest.raises(InputError, match=r"ends before 9\.0 s"):
         read(path, start=9.0, **options)
 
 
@@ -129,6 +129,7 @@ def test_equal_stamps_are_duplicates_and_left_out(tmp_path):
     assert audit.duplicated == 1
 
 
+@pytest.mark.skipif(not hasattr(av.VideoStream, "set_display_rotation"), reason="this PyAV cannot write a rotation")
 @pytest.mark.parametrize("turn", [90, -90, 180])
 def test_display_rotation_is_applied_as_opencv_does(turn, tmp_path):
     clip = write_clip(tmp_path / "r.mp4", [0, 3600, 7200], turn=turn)
@@ -295,7 +296,7 @@ def test_folders_of_clips(tmp_path):
     assert [p.name for p in list_clips(tmp_path)] == ["c2.mp4", "c10.mp4"]
     assert not is_clip_folder(tmp_path / "c2.mp4")
     cv2.imwrite(str(tmp_path / "a.png"), pictures(1)[0])
-    with pytest.raises(InputError, match="clips .* and images"):
+    with pytest.raises(InputError, match=r"clips .* and images"):
         is_clip_folder(tmp_path)
     with pytest.raises(InputError, match="No such file"):
         is_clip_folder(tmp_path / "nowhere")

@@ -5,6 +5,8 @@ table -> (undistort, snap) -> fit -> ground map -> H.json, picture, summary
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -25,11 +27,12 @@ from visfuse_cli.maths.homography_fit import Fit, fit_points
 from visfuse_cli.maths.lines import fit_lines
 from visfuse_cli.records import Array, GroundMap, Image, Lens, RunRequest, RunResult
 from visfuse_cli.vision.calibration_picture import draw
-from visfuse_cli.vision.lens import undistort_points
+from visfuse_cli.vision.lens import distort_points, undistort_points
 from visfuse_cli.vision.line_tracing import snap
 
 Size = tuple[int, int]
 FEW = 6  # below, leaving one out says more about the others' places than about its own
+FAR = 3e4  # the survey's distance from the world's origin, in its own extents, before double precision runs out
 
 
 class NoiseSettings(Section):
@@ -81,65 +84,81 @@ class CalibrateConfig(Section):
     limits: LimitSettings = LimitSettings()
 
 
+@dataclass(frozen=True, slots=True)
+class Survey:
+    """What was surveyed (marks (N, 2 or 4) in the image, world (N, 2 or 4) m) and the homography through it."""
+
+    noun: str
+    marks: Array
+    world: Array
+    fit: Fit
+    warnings: tuple[str, ...] = ()
+
+
 def run(request: RunRequest) -> RunResult:
     """Fit the homography and write it with its picture; raises InputError for input that cannot carry one."""
     config: CalibrateConfig = request.config
     options = request.options
-    picture_path = request.out.with_suffix(".png")
-    _check_output(request.out, picture_path if options.get("image") else None, request.overwrite)
+    picture_path = request.out.with_suffix(".png") if options.get("image") and not options.get("gaze") else None
+    _check_output(request, picture_path)
     lens, lens_size = read_lens(options["camera"]) if options.get("camera") else (None, None)
     image = _read_image(options["image"]) if options.get("image") else None
     size = _agreed_size(image, options, lens_size)
-    warnings: list[str] = []
-    if options.get("gaze"):
-        marks, world, fit = _from_gaze(options["gaze"], config)
-    elif options.get("lines"):
-        marks, world, fit = _from_lines(options["lines"], config, image, lens, warnings)
-    else:
-        marks, world, fit = _from_points(options["points"], config, lens)
-    warnings += _doubts(fit, marks, size if not options.get("gaze") else None, config)
+    survey = _survey(options, config, image, lens)
     ground = GroundMap(
-        ground_from_image=fit.H,
-        cov=fit.cov,
-        ground_sign=fit.ground_sign,
+        ground_from_image=survey.fit.H,
+        cov=survey.fit.cov,
+        ground_sign=survey.fit.ground_sign,
         input="gaze" if options.get("gaze") else "pixel",
         image_size=size,
         lens=lens,
-        rms_m=fit.rms_m,
-        rms_px=fit.rms_px,
-        residuals=_residuals(fit),
+        rms_m=survey.fit.rms_m,
+        rms_px=survey.fit.rms_px,
+        residuals=_residuals(survey.fit),
         source=request.input.name,
     )
+    picture = b""
+    if image is not None and picture_path is not None:
+        drawn = draw(image, ground, survey.marks, survey.world, survey.fit.used, config.noise.sigma_px)
+        picture = cv2.imencode(".png", drawn)[1].tobytes()
     homography_files.write(request.out, ground)
-    if image is not None and not options.get("gaze"):
-        drawn = draw(image, ground, marks, world, fit.used, config.noise.sigma_px)
+    if picture_path is not None:
         with replacing(picture_path) as file:
-            file.write(cv2.imencode(".png", drawn)[1].tobytes())
-    return RunResult(request.out, _summary(request, ground, fit, marks, warnings), tuple(warnings))
+            file.write(picture)
+    warnings = (*survey.warnings, *_doubts(survey, size if ground.input == "pixel" else None, config))
+    return RunResult(request.out, _summary(request, ground, survey, picture_path, warnings), warnings)
 
 
-def _check_output(out: Path, picture: Path | None, overwrite: bool) -> None:
+def _check_output(request: RunRequest, picture: Path | None) -> None:
+    out = request.out
     if out.is_dir():
         raise OutputError(f"{out}: is a folder; give --out the name of a file, like H.json")
     if not out.parent.is_dir():
         raise OutputError(f"{out.parent}: no such folder")
+    if picture == out:
+        raise OutputError(f"{out}: the picture beside it would take its name; give --out a name that ends in .json")
+    inputs = [path for path in request.options.values() if isinstance(path, Path)]
     for path in (out, picture):
-        if path is not None and path.exists() and not overwrite:
+        if path is None or not path.exists():
+            continue
+        if any(given.exists() and path.samefile(given) for given in inputs):
+            raise OutputError(f"{path}: is an input and would be overwritten; give --out another name")
+        if not request.overwrite:
             raise OutputError(f"{path}: exists; give --overwrite or another name")
 
 
 def _read_image(path: Path) -> Image:
     """A picture, or the first frame of a clip, as 8-bit BGR."""
-    if path.is_file():
-        try:
-            data = np.fromfile(path, np.uint8)
-        except OSError as problem:
-            raise InputError(f"{path}: cannot be read: {problem.strerror or problem}") from problem
-        image = cv2.imdecode(data, cv2.IMREAD_COLOR) if len(data) else None
-        if image is not None:
-            return np.asarray(image, dtype=np.uint8)
+    try:
+        image = cv2.imread(str(path), cv2.IMREAD_COLOR) if path.is_file() and cv2.haveImageReader(str(path)) else None
+    except cv2.error as problem:
+        raise InputError(f"{path}: not a readable picture") from problem
+    if image is not None:
+        return np.asarray(image, dtype=np.uint8)
     with open_source(path, fps=1.0) as source:
-        return next(source.frames()).image
+        for frame in source.frames():
+            return frame.image
+    raise InputError(f"{path}: holds no frame")
 
 
 def _agreed_size(image: Image | None, options: dict[str, Any], lens_size: Size | None) -> Size | None:
@@ -157,34 +176,53 @@ def _agreed_size(image: Image | None, options: dict[str, Any], lens_size: Size |
     return known[0][1] if known else None
 
 
-def _from_points(path: Path, config: CalibrateConfig, lens: Lens | None) -> tuple[Array, Array, Fit]:
+def _survey(options: dict[str, Any], config: CalibrateConfig, image: Image | None, lens: Lens | None) -> Survey:
+    if options.get("gaze"):
+        return _from_gaze(options["gaze"], config)
+    if options.get("lines"):
+        return _from_lines(options["lines"], config, image, lens)
+    path: Path = options["points"]
     marks, world = read_points(path)
-    image = marks if lens is None else undistort_points(marks, lens)
-    return marks, world, _named(path, lambda: fit_points(image, world, *_fitting(config)))
+    straight = _straightened(path, marks, lens)
+    return Survey("point", marks, world, _named(path, lambda: fit_points(straight, world, *_fitting(config))))
 
 
-def _from_lines(
-    path: Path, config: CalibrateConfig, image: Image | None, lens: Lens | None, warnings: list[str]
-) -> tuple[Array, Array, Fit]:
+def _from_lines(path: Path, config: CalibrateConfig, image: Image | None, lens: Lens | None) -> Survey:
     marks, world = read_lines(path)
+    warnings: tuple[str, ...] = ()
     if config.snap.enabled:
         if image is None:
             raise UsageError("snap.enabled needs --image: lines are moved onto the edges of a picture")
         marks, snapped = snap(image, marks, config.snap.radius_px)
-        warnings += [f"line {k + 1} has no edge under it and stays as drawn" for k in np.flatnonzero(~snapped)]
-    straight = marks if lens is None else undistort_points(marks.reshape(-1, 2), lens).reshape(-1, 4)
-    return marks, world, _named(path, lambda: fit_lines(straight, world, *_fitting(config)))
+        warnings = tuple(f"line {k + 1} has no edge under it and stays as drawn" for k in np.flatnonzero(~snapped))
+    straight = _straightened(path, marks.reshape(-1, 2), lens).reshape(-1, 4)
+    return Survey("line", marks, world, _named(path, lambda: fit_lines(straight, world, *_fitting(config))), warnings)
 
 
-def _from_gaze(path: Path, config: CalibrateConfig) -> tuple[Array, Array, Fit]:
+def _from_gaze(path: Path, config: CalibrateConfig) -> Survey:
     angles, world = read_gaze(path)
     marks = gaze.frontal(angles[:, 0], angles[:, 1], config.gaze.order)
     robust = config.robust.threshold_rad if config.robust.enabled else None
-    return (
-        marks,
-        world,
-        _named(path, lambda: fit_points(marks, world, config.noise.sigma_rad, robust, config.limits.condition)),
-    )
+
+    def measured(points: Array) -> Array:
+        return np.column_stack(gaze.angles(points, config.gaze.order))
+
+    def fit() -> Fit:
+        return fit_points(marks, world, config.noise.sigma_rad, robust, config.limits.condition, measured)
+
+    return Survey("point", marks, world, _named(path, fit))
+
+
+def _straightened(path: Path, marks: Array, lens: Lens | None) -> Array:
+    """Pixels (N, 2) without the lens's distortion; raises InputError where the lens model cannot be undone."""
+    if lens is None:
+        return marks
+    straight = undistort_points(marks, lens)
+    off = np.linalg.norm(distort_points(straight, lens) - marks, axis=1)
+    for k in np.flatnonzero(~(off < 0.1)):
+        u, v = marks[k]
+        raise InputError(f"{path}: the lens's distortion cannot be undone at pixel ({u:g}, {v:g}); wrong --camera?")
+    return straight
 
 
 def _fitting(config: CalibrateConfig) -> tuple[float, float | None, float]:
@@ -192,33 +230,39 @@ def _fitting(config: CalibrateConfig) -> tuple[float, float | None, float]:
     return config.noise.sigma_px, robust, config.limits.condition
 
 
-def _named(path: Path, fit: Any) -> Fit:
+def _named(path: Path, fit: Callable[[], Fit]) -> Fit:
     """Run a fit; its refusal names the file."""
     try:
-        result: Fit = fit()
+        return fit()
     except InputError as problem:
         raise InputError(f"{path}: {problem}") from problem
     except np.linalg.LinAlgError as problem:
-        raise InputError(f"{path}: these points do not determine a homography ({problem})") from problem
-    return result
+        raise InputError(f"{path}: this input does not determine a homography ({problem})") from problem
 
 
-def _doubts(fit: Fit, marks: Array, size: Size | None, config: CalibrateConfig) -> list[str]:
+def _doubts(survey: Survey, size: Size | None, config: CalibrateConfig) -> list[str]:
     """What a person should know before trusting this calibration."""
-    doubts = []
-    for k in np.flatnonzero(~fit.used):
-        doubts.append(f"row {k + 1} disagrees with the others by {fit.error_px[k]:.1f} px and was dropped")
+    noun, fit, doubts = survey.noun, survey.fit, []
+    for k in map(int, np.flatnonzero(~fit.used)):
+        doubts.append(f"{noun} {k + 1} disagrees with the others by {fit.error_m[k]:.1f} m on the ground and was dropped")
     if fit.used.sum() < FEW:
-        doubts.append(f"{int(fit.used.sum())} points leave little to check them with; six or more are better")
-    for k in np.flatnonzero(np.nan_to_num(fit.leave_one_out_m) > config.limits.leave_one_out_m):
+        doubts.append(f"{int(fit.used.sum())} {noun}s leave little to check them with; six or more are better")
+    for k in map(int, np.flatnonzero(fit.leave_one_out_m > config.limits.leave_one_out_m)):
         doubts.append(
-            f"leaving out row {k + 1} moves it by {fit.leave_one_out_m[k]:.1f} m: the calibration hangs on it"
+            f"leaving out {noun} {k + 1} moves it by {fit.leave_one_out_m[k]:.1f} m: the calibration hangs on it"
+        )
+    ground = survey.world.reshape(-1, 2)
+    far, extent = float(np.abs(ground).max()), float(np.ptp(ground, axis=0).max())
+    if far > FAR * extent:
+        doubts.append(
+            f"the ground points lie {far / 1000:.0f} km from their origin, too far for the covariance's digits; "
+            "subtract a constant from X and Y"
         )
     if size is not None:
-        for k, mark in enumerate(marks):
+        for k, mark in enumerate(survey.marks):
             ends = mark.reshape(-1, 2)
             if np.any((ends < -0.5) | (ends > np.array(size) - 0.5)):
-                doubts.append(f"row {k + 1} lies outside the {size[0]}x{size[1]} image")
+                doubts.append(f"{noun} {k + 1} lies outside the {size[0]}x{size[1]} image")
     return doubts
 
 
@@ -226,32 +270,42 @@ def _residuals(fit: Fit) -> tuple[dict[str, Any], ...]:
     return tuple(
         {
             "index": k,
-            "error_m": float(fit.error_m[k]),
-            "error_px": float(fit.error_px[k]),
-            "leave_one_out_m": float(fit.leave_one_out_m[k]) if np.isfinite(fit.leave_one_out_m[k]) else None,
+            "error_m": _finite(fit.error_m[k]),
+            "error_px": _finite(fit.error_px[k]),
+            "leave_one_out_m": _finite(fit.leave_one_out_m[k]),
             "used": bool(fit.used[k]),
         }
         for k in range(len(fit.used))
     )
 
 
-def _summary(request: RunRequest, ground: GroundMap, fit: Fit, marks: Array, warnings: list[str]) -> dict[str, Any]:
+def _finite(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None
+
+
+def _summary(
+    request: RunRequest, ground: GroundMap, survey: Survey, picture: Path | None, warnings: tuple[str, ...]
+) -> dict[str, Any]:
+    fit = survey.fit
     left_out = fit.leave_one_out_m[np.isfinite(fit.leave_one_out_m)]
     summary: dict[str, Any] = {
         "out": str(request.out),
+        "picture": None if picture is None else str(picture),
         "input": ground.input,
         "n": len(fit.used),
         "used": int(fit.used.sum()),
+        "dropped": [int(k) + 1 for k in np.flatnonzero(~fit.used)],
         "rms_m": fit.rms_m,
         "rms_px": fit.rms_px,
+        "sigma_px": fit.sigma_px,
         "leave_one_out_worst_m": float(left_out.max()) if len(left_out) else None,
         "condition": fit.condition,
-        "warnings": warnings,
+        "warnings": list(warnings),
     }
     if ground.input == "pixel":
-        centre = marks.reshape(-1, 2).mean(axis=0, keepdims=True)
-        error = float(speed_error(ground, centre, fit.sigma_px)[0])
-        summary["speed_sigma_kmh"] = error if np.isfinite(error) else None
+        marks = survey.marks[fit.used].reshape(-1, 2).mean(axis=0, keepdims=True)
+        centre = marks if ground.lens is None else undistort_points(marks, ground.lens)
+        summary["speed_sigma_kmh"] = _finite(speed_error(ground, centre, request.config.noise.sigma_px)[0])
     return summary
 
 
@@ -259,13 +313,17 @@ def text(result: RunResult) -> str:
     """The summary for people."""
     s = result.summary
     unit, scale = ("px", 1.0) if s["input"] == "pixel" else ("mrad", 1000.0)
+    dropped = f", dropped {', '.join(map(str, s['dropped']))}" if s["dropped"] else ""
     lines = [
-        f"used         {s['used']} of {s['n']}",
+        f"used         {s['used']} of {s['n']}{dropped}",
         f"residual     {s['rms_m']:.3f} m, {s['rms_px'] * scale:.2f} {unit} (rms)",
+        f"condition    {s['condition']:.3g}",
     ]
     if s["leave_one_out_worst_m"] is not None:
         lines.append(f"leave one out {s['leave_one_out_worst_m']:.2f} m at worst")
     if s.get("speed_sigma_kmh") is not None:
         lines.append(f"expect       +-{1.96 * s['speed_sigma_kmh']:.1f} km/h (95 %) on 50 km/h over 1 s, mid-survey")
     lines.append(f"homography   {s['out']}")
+    if s["picture"] is not None:
+        lines.append(f"picture      {s['picture']}")
     return "\n".join(lines)

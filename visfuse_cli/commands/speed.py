@@ -55,15 +55,14 @@ class BackgroundSettings(Section):
     threshold: float = Field(16.0, gt=0, le=1000, description="squared distance (variances) of a foreground pixel")
     memory_s: float = Field(60.0, gt=0, le=36000, description="s: how long the background remembers")
     shadow_ratio: float = Field(0.45, gt=0, lt=1, description="darkest a shadow may be, as a share of the lit ground")
-    warmup_s: float = Field(12.0, ge=0, le=600, description="s: the empty scene is the median over this much footage")
+    warmup_s: float = Field(20.0, ge=0, le=600, description="s: the empty scene is the median over this much footage")
 
 
 class RegionSettings(Section):
     """Cleaning of the foreground, in metres at the scale of the ground."""
 
-    gap: float = Field(0.5, ge=0, le=5, description="m: gaps up to this size are closed")
-    bridge: float = Field(0.9, ge=0, le=5, description="m: gaps up to this size are closed where they look like shadow")
-    speck: float = Field(0.15, ge=0, le=5, description="m: specks below this size are removed")
+    gap: float = Field(0.3, ge=0, le=5, description="m: gaps up to this size are closed")
+    speck: float = Field(0.12, ge=0, le=5, description="m: specks below this size are removed")
 
 
 class DisplaySettings(Section):
@@ -232,7 +231,7 @@ class _MovingRegions:
     def regions(self, frame: Frame) -> list[Region]:
         labels = self._background.detect(frame.image)
         settings, smallest = self._clip.config.regions, self._clip.config.target.smallest
-        found = region_tools.find(labels, self._bands, settings.gap, settings.bridge, settings.speck, smallest)
+        found = region_tools.find(labels, self._bands, settings.gap, settings.speck, smallest)
         lens = self._clip.camera.ground.lens
         return found if lens is None else [region_tools.undistorted(region, lens) for region in found]
 

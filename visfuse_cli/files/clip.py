@@ -14,7 +14,6 @@ from typing import Any
 import av
 import cv2
 import numpy as np
-from av.format import Flags
 from av.stream import Disposition
 
 from visfuse_cli.errors import InputError
@@ -25,6 +24,7 @@ from visfuse_cli.records import Image
 av.logging.set_level(None)
 
 FULL_RANGE = 2  # AVColorRange JPEG
+NO_TIMESTAMPS = 0x80  # AVFMT_NOTIMESTAMPS
 CLOCK_SET = 1980  # a clock that was never set says 1904 or 1970
 MAX_READ_FAILURES = 8
 TURNS = {90: cv2.ROTATE_90_COUNTERCLOCKWISE, 180: cv2.ROTATE_180, 270: cv2.ROTATE_90_CLOCKWISE}
@@ -55,7 +55,7 @@ class Clip:
                 raise InputError(f"{path}: not one frame of it can be decoded")
             self._shape = (first[0].height, first[0].width)
             self._turn = round(first[0].rotation / 90) * 90 % 360
-            self._stamped = first[0].pts is not None and not container.format.flags & Flags.no_timestamps.value
+            self._stamped = first[0].pts is not None and not container.format.flags & NO_TIMESTAMPS
             self._tick = Fraction(first[0].time_base or stream.time_base or 1)
             self._first_pts = first[0].pts or 0
             self._interval = 1 / self._rate(stream, first, fps)
@@ -143,6 +143,7 @@ class Clip:
             raise InputError(f"{self.path}: cannot be read as a video: {reason}") from problem
         with container:
             streams = [s for s in container.streams.video if not s.disposition & Disposition.attached_pic]
+            # Cover art and single images come as video streams too.
             if not streams or container.format.name.endswith("_pipe") or container.format.name == "image2":
                 raise InputError(f"{self.path}: holds no video; give a video file or a folder of images")
             streams[0].thread_type = "AUTO"

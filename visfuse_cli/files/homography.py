@@ -13,6 +13,7 @@ from visfuse_cli.files.atomic import write_json
 from visfuse_cli.records import Array, GroundMap, Lens
 
 SCHEMA = "visfuse.homography/1"
+COEFFICIENTS = (4, 5, 8, 12, 14)  # lengths of OpenCV's distortion
 
 
 def write(path: Path, ground: GroundMap) -> None:
@@ -40,7 +41,7 @@ def read(path: Path) -> GroundMap:
         document = json.loads(Path(path).read_text(encoding="utf-8"))
     except OSError as problem:
         raise InputError(f"{path}: cannot read the homography: {problem.strerror or problem}") from problem
-    except (UnicodeDecodeError, json.JSONDecodeError, RecursionError) as problem:
+    except (ValueError, RecursionError) as problem:  # not UTF-8, not JSON, or a number of thousands of digits
         raise InputError(f"{path}: not JSON; give the H.json that calibrate-homography wrote") from problem
     if not isinstance(document, dict) or document.get("schema") != SCHEMA:
         raise InputError(f'{path}: not a homography: "schema" must be "{SCHEMA}"')
@@ -51,7 +52,7 @@ def read(path: Path) -> GroundMap:
     if kind not in ("pixel", "gaze"):
         raise InputError(f'{path}: "input" is {kind!r}; it must be "pixel" or "gaze"')
     sign = _get(path, document, "ground_sign")
-    if sign not in (1, -1):
+    if isinstance(sign, bool) or sign not in (1, -1):
         raise InputError(f'{path}: "ground_sign" is {sign!r}; it must be 1 or -1')
     return GroundMap(
         ground_from_image=H,
@@ -62,7 +63,7 @@ def read(path: Path) -> GroundMap:
         lens=_lens(path, document),
         rms_m=float(_array(path, document, "rms_m", ())),
         rms_px=float(_array(path, document, "rms_px", ())),
-        residuals=tuple(document.get("residuals") or ()),
+        residuals=_residuals(path, document),
         source=str(document.get("source", "")),
     )
 
@@ -77,7 +78,7 @@ def _array(path: Path, document: dict[str, Any], key: str, shape: tuple[int, ...
     value = _get(path, document, key)
     try:
         array = np.array(value, dtype=float)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         array = np.array(np.nan)
     if array.shape != shape or not np.isfinite(array).all():
         wanted = "x".join(map(str, shape)) + " numbers" if shape else "a number"
@@ -111,7 +112,17 @@ def _lens(path: Path, document: dict[str, Any]) -> Lens | None:
     if not isinstance(value, dict):
         raise InputError(f'{path}: "lens" must be {{"K": 3x3, "D": coefficients}}, or null')
     K = _array(path, value, "K", (3, 3))
-    D = np.ravel(_get(path, value, "D"))
-    if D.dtype.kind not in "if" or D.size not in (4, 5, 8, 12, 14) or not np.isfinite(D).all():
-        raise InputError(f'{path}: "lens.D" must be 4, 5, 8, 12 or 14 finite coefficients')
-    return Lens(K, D.astype(float))
+    if not (K[0, 0] > 0 and K[1, 1] > 0 and K[2, 2] == 1):
+        raise InputError(f'{path}: "lens.K" is not a camera matrix [fx 0 cx; 0 fy cy; 0 0 1]')
+    coefficients = _get(path, value, "D")
+    count = len(coefficients) if isinstance(coefficients, list) else 0
+    if count not in COEFFICIENTS:
+        raise InputError(f'{path}: "lens.D" must be a list of {", ".join(map(str, COEFFICIENTS))} coefficients')
+    return Lens(K, _array(path, value, "D", (count,)))
+
+
+def _residuals(path: Path, document: dict[str, Any]) -> tuple[dict[str, Any], ...]:
+    value = document.get("residuals") or []
+    if not (isinstance(value, list) and all(isinstance(row, dict) for row in value)):
+        raise InputError(f'{path}: "residuals" must be a list of objects')
+    return tuple(value)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
+from contextlib import suppress
 from datetime import datetime
 from pathlib import Path
 from types import TracebackType
@@ -61,7 +62,7 @@ class VideoSource:
         self.frame_count = _count_within(reader, start, end)  # an estimate, or None
         self._reader = reader
         self._auditor = TimeAuditor(path.name)
-        self._open: list[Iterator[Frame]] = []
+        self._open: list[Generator[Frame, None, None]] = []
 
     def __enter__(self) -> VideoSource:
         return self
@@ -70,7 +71,8 @@ class VideoSource:
         self, kind: type[BaseException] | None, problem: BaseException | None, trace: TracebackType | None
     ) -> None:
         for frames in self._open:
-            frames.close()  # type: ignore[attr-defined]
+            with suppress(ValueError):  # still running in another thread, which ends it
+                frames.close()
         self._open.clear()
 
     def frames(self) -> Iterator[Frame]:
@@ -83,7 +85,7 @@ class VideoSource:
         """What the last reading found out about the times and losses of the frames it yielded."""
         return self._auditor.result()
 
-    def _frames(self) -> Iterator[Frame]:
+    def _frames(self) -> Generator[Frame, None, None]:
         auditor = self._auditor = TimeAuditor(self.path.name, self._reader.resolution_s)
         repeats = _RepeatDetector()
         last = -math.inf

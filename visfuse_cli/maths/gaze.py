@@ -10,7 +10,7 @@ ORDERS = ("elevation-vergence", "vergence-elevation")
 
 
 def frontal(elevation: Array, vergence: Array, order: str = ORDERS[0]) -> Array:
-    """Frontal-plane point (N, 2), first axis left, second up, from elevation (up) and vergence (left) in rad, each (N,).
+    """Frontal-plane point (N, 2), first axis left, second up, from elevation (up) and vergence (left), (N,) rad each.
 
     order: which axis is outside; with elevation outside the point is (tan v / cos e, tan e, 1), with vergence outside
     (tan v, tan e / cos v, 1). The image's axes u and v point the other way. Bradshaw 1997, sec. 3, corrected.

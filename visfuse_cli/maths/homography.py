@@ -10,7 +10,19 @@ from visfuse_cli.records import Array
 def apply(H: Array, points: Array) -> Array:
     """Map points (N, 2) by H (3, 3): (N, 2)."""
     homogeneous = points @ H[:, :2].T + H[:, 2]
-    return homogeneous[:, :2] / homogeneous[:, 2:]
+    return np.asarray(homogeneous[:, :2] / homogeneous[:, 2:])
+
+
+def invert(H: Array) -> Array:
+    """The inverse map (3, 3) up to scale and sign: the adjugate, which exists for every H."""
+    (a, b, c), (d, e, f), (g, h, i) = H.tolist()  # plain numbers: this runs in the innermost loop of every fit
+    return np.array(
+        [
+            [e * i - f * h, c * h - b * i, b * f - c * e],
+            [f * g - d * i, a * i - c * g, c * d - a * f],
+            [d * h - e * g, b * g - a * h, a * e - b * d],
+        ]
+    )
 
 
 def depth(H: Array, points: Array) -> Array:
@@ -34,7 +46,10 @@ def entry_jacobian(H: Array, points: Array) -> Array:
     return J
 
 
-def normalised(H: Array) -> Array:
-    """H scaled to H[2][2] = 1, or to unit Frobenius norm where the image's corner lies on the horizon."""
-    norm = np.linalg.norm(H)
-    return H / H[2, 2] if abs(H[2, 2]) > 1e-6 * norm else H / norm
+def on_horizon(H: Array, points: Array) -> bool:
+    """Whether the image's corner lies on the horizon, so that H cannot be scaled to H[2][2] = 1.
+
+    `points` (N, 2) lie on the visible ground: what is nearly 0 is judged by the third coordinate there, so that far
+    away world origins (UTM) change nothing.
+    """
+    return bool(abs(H[2, 2]) <= 1e-6 * np.abs(depth(H, points)).max())

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from visfuse_cli.maths.assignment import assign
 from visfuse_cli.records import Array, Region
@@ -52,39 +53,50 @@ def region_boxes(regions: list[Region]) -> Array:
     return np.concatenate([boxes[:, :2], boxes[:, :2] + boxes[:, 2:]], axis=1)
 
 
-def claim(regions: list[Region], reach: Array) -> tuple[list[Claim | None], np.ndarray]:
-    """Give regions to the things whose tangents are predicted as `reach` (T, K).
+@dataclass(frozen=True, slots=True)
+class Claims:
+    """One claim (or none) a thing; which regions (R,) were given out, and which lie where a thing is (also unused)."""
 
-    Returns one claim (or none) for each thing, and which regions (R,) are spoken for. Fragments inside one prediction
-    are joined; a region over several predictions is shared, each thing keeping only the tangents where it lies outermost.
+    of: list[Claim | None]
+    used: NDArray[np.bool_]
+    near: NDArray[np.bool_]
+
+
+def claim(regions: list[Region], reach: Array, join_share: float = np.inf) -> Claims:
+    """Give regions to the things whose tangents are predicted as `reach` (T, K), one to one.
+
+    Fragments inside one prediction are joined when the gap to its region is below `join_share` of that region's size;
+    a region over several predictions is shared, each thing keeping only the tangents where it lies outermost.
     """
-    taken = np.zeros(len(regions), dtype=bool)
-    claims: list[Claim | None] = [None] * len(reach)
+    used = np.zeros(len(regions), dtype=bool)
+    of: list[Claim | None] = [None] * len(reach)
     if not len(regions) or not len(reach):
-        return claims, taken
-    iou, inside, covered = overlap(region_boxes(regions), boxes_of(reach))
-    taken = np.any((inside >= 0.3) | (covered >= COVERED), axis=1)
+        return Claims(of, used, used.copy())
+    boxes = region_boxes(regions)
+    iou, inside, covered = overlap(boxes, boxes_of(reach))
     shared = np.sum(covered >= COVERED, axis=1) > 1
     belongs = ((inside >= INSIDE) | (covered >= COVERED) | (iou >= 0.2)) & ~shared[:, None]
-    parts: list[list[int]] = [[] for _ in reach]
     pairs, loose, _ = assign(np.where(belongs, 1 - iou, np.inf))
-    for r, thing in pairs:
-        parts[thing].append(int(r))
-    for r in loose:  # fragments
+    parts = {int(thing): [int(r)] for r, thing in pairs}
+    for r in loose:
         thing = int(np.argmax(inside[r]))
-        if inside[r, thing] >= INSIDE and not shared[r]:
-            parts[thing].append(int(r))
+        if inside[r, thing] >= INSIDE and not shared[r] and thing in parts:
+            main = boxes[parts[thing][0]]
+            gap = np.max(np.maximum(main[:2] - boxes[r, 2:], boxes[r, :2] - main[2:]))
+            if gap <= join_share * np.max(main[2:] - main[:2]):
+                parts[thing].append(int(r))
     everywhere = np.ones(DIRECTIONS, dtype=bool)
-    for thing, members in enumerate(parts):
-        if members:
-            claims[thing] = Claim(region_tools.joined([regions[r] for r in members]), everywhere)
+    for thing, members in parts.items():
+        of[thing] = Claim(region_tools.joined([regions[r] for r in members]), everywhere)
+        used[members] = True
     for r in np.flatnonzero(shared):
         together = np.flatnonzero(covered[r] >= COVERED)
         for thing in together:
-            if claims[thing] is None:
+            if of[thing] is None:
                 others = np.max(reach[together[together != thing]], axis=0)
-                claims[thing] = Claim(regions[r], reach[thing] > others + OWN_PX)
-    return claims, taken
+                of[thing] = Claim(regions[r], reach[thing] > others + OWN_PX)
+                used[r] = True
+    return Claims(of, used, np.any((inside >= 0.3) | (covered >= COVERED), axis=1))
 
 
 def footprint_contains(outer_pose: Array, outer_size: Array, point: Array) -> bool:

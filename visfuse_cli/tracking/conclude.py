@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from visfuse_cli.maths import homography
 from visfuse_cli.maths.assignment import gate_size
@@ -18,6 +19,9 @@ from visfuse_cli.tracking.dynamics import Dynamics, Step
 from visfuse_cli.tracking.ground import Sample, Track
 from visfuse_cli.tracking.settings import TrackerSettings
 from visfuse_cli.vision.wireframe import Outlines
+
+
+START_DOUBT = 5.0  # times the deviations a new track begins with
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,6 +42,7 @@ class Path:
     pose_cov: Array
     heading: Array
     size: Array
+    size_z: float  # how many deviations the size lies from its class, at worst
     calibration: Array
     pixel: Array
     nis: Array
@@ -51,12 +56,13 @@ def conclude(track: Track, camera: GroundCamera, settings: TrackerSettings, dyna
     samples, steps, size, misfit = track.samples, track.steps, track.size, np.nan
     nis = _nis(steps)
     class_name = track.prior_class.name
+    measured = np.array([s.measured for s in samples])
     if settings.smooth:
         heading = dynamics.heading(_smooth(steps, dynamics).mean)
         rough = np.stack([step.posterior.mean for step in steps])
         pose = np.column_stack([rough[:, :2], heading])
         outlines = Outlines(np.stack([s.support for s in samples]), np.stack([s.valid for s in samples]))
-        used = np.array([s.measured for s in samples])
+        used = measured
         prior, size, _, _ = measure.classify(
             camera,
             Outlines(outlines.support[used], outlines.valid[used]),
@@ -67,7 +73,7 @@ def conclude(track: Track, camera: GroundCamera, settings: TrackerSettings, dyna
         class_name = prior.name
         fit = measure.fit_poses(camera, outlines, pose, size, np.full(3, 0.01), settings.pose)
         misfit = float(np.median(fit.rms[used]))
-        steps = _filter_again(samples, steps, fit, pose, size, settings, dynamics)
+        steps, measured = _filter_again(samples, steps, fit, pose, size, settings, dynamics)
         nis = _nis(steps)
         belief: Gaussian = _smooth(steps, dynamics)
     else:
@@ -76,8 +82,6 @@ def conclude(track: Track, camera: GroundCamera, settings: TrackerSettings, dyna
     pose_cov = symmetrise(J @ belief.cov @ np.swapaxes(J, -1, -2))
     calibration, pixel = _calibration(camera, planar)
     cov = symmetrise(pose_cov + calibration @ camera.ground.cov @ np.swapaxes(calibration, -1, -2))
-    measured = np.array([step.innovation is not None for step in steps])
-    measured[0] = True
     return Path(
         id=track.id,
         class_name=class_name,
@@ -89,6 +93,7 @@ def conclude(track: Track, camera: GroundCamera, settings: TrackerSettings, dyna
         pose_cov=pose_cov,
         heading=dynamics.heading(belief.mean),
         size=size,
+        size_z=_size_z(size, class_name, settings),
         calibration=calibration,
         pixel=pixel,
         nis=nis,
@@ -96,6 +101,12 @@ def conclude(track: Track, camera: GroundCamera, settings: TrackerSettings, dyna
         misfit_px=misfit,
         ended_by=track.ended_by,
     )
+
+
+def _size_z(size: Array, class_name: str, settings: TrackerSettings) -> float:
+    prior = next(c for c in settings.target.classes if c.name == class_name)
+    mean, sigma = measure.prior_arrays(prior)
+    return float(np.max(np.abs(size - mean) / sigma))
 
 
 def _nis(steps: list[Step]) -> Array:
@@ -116,7 +127,7 @@ def _filter_again(
     size: Array,
     settings: TrackerSettings,
     dynamics: Dynamics,
-) -> list[Step]:
+) -> tuple[list[Step], NDArray[np.bool_]]:
     """Filter the settled poses; a second time with the noise that the innovations of the whole track speak of."""
     measured = [
         dynamics.measured(*measure.measurement(fit, k, pose[k])) if samples[k].measured and fit.ok[k] else None
@@ -124,11 +135,11 @@ def _filter_again(
     ]
     scale = 1.0
     for _ in range(2 if settings.filter.adapt_noise else 1):
-        steps = _filter(samples, steps[0], measured, scale, float(size[0]), settings, dynamics)
+        steps, trusted = _filter(samples, steps[0], measured, scale, float(size[0]), settings, dynamics)
         nis = _nis(steps)
         if len(nis) >= 5:
             scale *= float(np.clip(np.mean(nis) / len(dynamics.H), 0.2, 25.0))
-    return steps
+    return steps, trusted
 
 
 def _filter(
@@ -139,35 +150,28 @@ def _filter(
     length: float,
     settings: TrackerSettings,
     dynamics: Dynamics,
-) -> list[Step]:
+) -> tuple[list[Step], NDArray[np.bool_]]:
+    """One pass over settled poses, and which of them lay inside the gate; it begins knowing nearly nothing."""
     gate = gate_size(len(dynamics.H), settings.pose.gate)
-    steps = [_begin(first, measured[0], scale, dynamics)]
-    for k in range(1, len(samples)):
-        dt = np.array([samples[k].t - samples[k - 1].t])
-        expected = dynamics_tools.predict(dynamics, [steps[-1].posterior], dt, np.array([length]))[0]
-        step = dynamics_tools.coast(expected, steps[-1].memory)
-        now = measured[k]
+    H = dynamics.H
+    belief = Gaussian(first.posterior.mean, first.posterior.cov * START_DOUBT**2)
+    steps: list[Step] = []
+    trusted = np.zeros(len(samples), dtype=bool)
+    for k, now in enumerate(measured):
+        dt = np.array([samples[k].t - samples[k - 1].t if k else 0.0])
+        expected = dynamics_tools.predict(dynamics, [belief], dt, np.array([length]))[0]
+        memory = steps[-1].memory if steps else None
+        step = dynamics_tools.coast(expected, memory)
         if now is not None:
             z, R = now[0], now[1] * scale
             gamma = dynamics_tools.residual(dynamics, z, expected.prior.mean)
-            H = dynamics.H
-            if mahalanobis(gamma, H @ expected.prior.cov @ H.T + R) < gate:
-                step = dynamics_tools.take(dynamics, expected, z, R, step.memory)
+            nis = float(mahalanobis(gamma, H @ expected.prior.cov @ H.T + R))
+            # Outside the gate a measurement counts less the further off it is: a bad start is left behind in the end.
+            step = dynamics_tools.take(dynamics, expected, z, R * max(1.0, nis / gate) ** 2, memory)
+            trusted[k] = nis < gate
         steps.append(step)
-    return steps
-
-
-def _begin(first: Step, measured: tuple[Array, Array] | None, scale: float, dynamics: Dynamics) -> Step:
-    """The first state again, from the settled pose; its velocity is what the causal filter began with."""
-    start = first.posterior
-    if measured is not None:
-        z, R = measured
-        gain_free = dynamics.H.T @ dynamics.H
-        mean = start.mean + dynamics.H.T @ dynamics_tools.residual(dynamics, z, start.mean)
-        keep = np.eye(len(start.mean)) - gain_free
-        cov = keep @ start.cov @ keep + dynamics.H.T @ (R * scale) @ dynamics.H
-        start = Gaussian(mean, symmetrise(cov))
-    return Step(start, start, first.F, None, None)
+        belief = step.posterior
+    return steps, trusted
 
 
 def _calibration(camera: GroundCamera, planar: Array) -> tuple[Array, Array]:

@@ -19,6 +19,11 @@ from visfuse_cli.tracking.settings import SizePrior, TrackerSettings
 from visfuse_cli.vision import wireframe
 from visfuse_cli.vision.wireframe import DIRECTIONS, FAN, Outlines
 
+VAGUE_M = 1.5  # m: a pose less certain than this is no measurement
+YOUNG, LEAP = 12, 4.0  # frames after which one measurement may not change the velocity by more (m/s)
+FRAGMENT_GAP = 0.25  # of a region's size: parts of one vehicle lie closer together, two vehicles mostly apart
+ALIEN_PX, ALIEN_SHARE = 8.0, 0.25  # how far a tangent may stick out of its prediction, px or share of the size
+
 
 @dataclass(slots=True)
 class Sample:
@@ -45,6 +50,7 @@ class Track:
     steps: list[Step]
     last_measured: float
     refused: int = 0  # measurements that fell outside the gate
+    refused_since: float | None = None  # s: since when all of them did
     ended_by: str = ""
 
 
@@ -107,9 +113,9 @@ class GroundTracker:
 
     def update(self, frame: int, regions: list[Region]) -> tuple[list[Track], list[Abandoned]]:
         """Give the frame's regions to tracks and candidates; returns the tracks and candidates that ended."""
-        claims, taken = claim(regions, self._reach)
-        self._measure(frame, claims)
-        free = [region for region, is_taken in zip(regions, taken, strict=True) if not is_taken]
+        claims = claim(regions, self._reach)
+        self._measure(frame, claims.of)
+        free = [region for region, near in zip(regions, claims.near | claims.used, strict=True) if not near]
         self._feed_candidates(frame, free)
         self._confirm()
         return self._end(), self._give_up()
@@ -151,6 +157,11 @@ class GroundTracker:
         if not claims:
             return
         samples = [self._unseen(frame) if c is None else self._seen(frame, c.region, c.own) for c in claims]
+        for sample, reach in zip(samples, self._reach, strict=True):
+            # What sticks out of the prediction is somebody else's, joined to this one in the picture.
+            alien = sample.valid & (sample.support > reach + max(ALIEN_PX, ALIEN_SHARE * float(np.ptp(reach)) / 2))
+            sample.valid &= ~alien
+            sample.whole &= not alien.any()
         outlines = Outlines(np.array([s.support for s in samples]), np.array([s.valid for s in samples]))
         size = np.array([track.size for track in self.tracks])
         sigma = np.array([track.size_sigma for track in self.tracks])
@@ -160,22 +171,27 @@ class GroundTracker:
             sample.measured = False
             if fit.ok[k] and sample.valid.any():
                 z, R = self.dynamics.measured(*measure.measurement(fit, k, self._pose[k]))
-                if self._plausible(step, z, R, fit, k):
-                    step = dynamics_tools.take(self.dynamics, self._expected[k], z, R, step.memory)
-                    sample.measured = True
-                    track.last_measured = sample.t
+                tried = dynamics_tools.take(self.dynamics, self._expected[k], z, R, step.memory)
+                if self._plausible(track, tried, z, R, fit, k):
+                    step, sample.measured = tried, True
+                    track.last_measured, track.refused_since = sample.t, None
                     self._learn_size(track, fit, k)
                 else:
                     track.refused += 1
+                    track.refused_since = sample.t if track.refused_since is None else track.refused_since
             track.samples.append(sample)
             track.steps.append(step)
 
-    def _plausible(self, step: Step, z: Array, R: Array, fit: wireframe.BoxFit, k: int) -> bool:
-        """The gate on the ground plane, and a box that looks like its region."""
+    def _plausible(self, track: Track, step: Step, z: Array, R: Array, fit: wireframe.BoxFit, k: int) -> bool:
+        """Enough outline to place the box, a box that looks like its region, inside the gate, and no leap of speed."""
+        if R[0, 0] + R[1, 1] > VAGUE_M**2 or fit.rms[k] > max(6.0, 0.15 * np.ptp(self._reach[k])):
+            return False
         H = self.dynamics.H
         gamma = dynamics_tools.residual(self.dynamics, z, step.prior.mean)
-        nis = mahalanobis(gamma, H @ step.prior.cov @ H.T + R)
-        return bool(nis < self._gate and fit.rms[k] < max(6.0, 0.15 * np.ptp(self._reach[k])))
+        if mahalanobis(gamma, H @ step.prior.cov @ H.T + R) > self._gate:
+            return False
+        before, after = (self.dynamics.planar(x)[0][2:] for x in (step.prior.mean, step.posterior.mean))
+        return len(track.samples) < YOUNG or float(np.hypot(*(after - before))) < LEAP
 
     def _learn_size(self, track: Track, fit: wireframe.BoxFit, k: int) -> None:
         # Frames of one target share their errors (the same light, the same shadow): each counts as a tenth.
@@ -188,14 +204,14 @@ class GroundTracker:
 
     def _feed_candidates(self, frame: int, regions: list[Region]) -> None:
         drifted = [c.box + np.tile(c.drift * (self._t - c.samples[-1].t), 2) for c in self.candidates]
-        claims, taken = claim(regions, reach_of(np.array(drifted).reshape(-1, 4)))
-        for candidate, claimed in zip(self.candidates, claims, strict=True):
+        claims = claim(regions, reach_of(np.array(drifted).reshape(-1, 4)), FRAGMENT_GAP)
+        for candidate, claimed in zip(self.candidates, claims.of, strict=True):
             if claimed is not None and claimed.own.all():
                 self._extend(candidate, frame, claimed.region)
             elif candidate.missed_since is None:
                 candidate.missed_since = self._t
-        for region, is_taken in zip(regions, taken, strict=True):
-            if not is_taken:
+        for region, used in zip(regions, claims.used, strict=True):
+            if not used:
                 fresh = Candidate([], [], region_boxes([region])[0])
                 self._extend(fresh, frame, region)
                 self.candidates.append(fresh)
@@ -230,7 +246,7 @@ class GroundTracker:
     def _born(self, candidate: Candidate) -> Track | None:
         """A track, when the candidate's foot has moved far and straight enough on the ground to tell its heading."""
         life = self.settings.life
-        if len(candidate.anchors) < life.confirm_frames:
+        if len(candidate.anchors) < life.confirm_frames or candidate.anchors[-1][3] > life.birth_scale:
             return None
         a = np.array(candidate.anchors)
         t = a[:, 0] - a[:, 0].mean()
@@ -251,11 +267,12 @@ class GroundTracker:
             self.camera, outlines, pose, self.settings.target.classes, self.settings.pose
         )
         fit = measure.fit_poses(self.camera, outlines, fit.pose, size, np.full(3, 0.05), self.settings.pose, 0.12)
-        return self._replay(samples, fit, heading, velocity, prior, size, size_sigma)
+        return self._replay(samples, outlines, fit, heading, velocity, prior, size, size_sigma)
 
     def _replay(
         self,
         samples: list[Sample],
+        outlines: Outlines,
         fit: wireframe.BoxFit,
         heading: float,
         velocity: Array,
@@ -264,10 +281,12 @@ class GroundTracker:
         size_sigma: Array,
     ) -> Track | None:
         """Run the filter over the frames seen before confirmation."""
-        usable = np.flatnonzero(fit.ok & (np.sqrt(fit.cov[:, 0, 0] + fit.cov[:, 1, 1]) < 2.0))
-        if len(usable) < 2:
+        fits = fit.rms < max(6.0, 0.15 * float(np.median(measure.extent(outlines))))
+        usable = np.flatnonzero(fit.ok & fits & (np.sqrt(fit.cov[:, 0, 0] + fit.cov[:, 1, 1]) < 2.0))
+        if len(usable) < 2 or usable[-1] != len(samples) - 1:
             return None
-        first = int(usable[0])
+        # What came before an outline that no box fits was another thing: two vehicles apart since.
+        first = int(max(usable[0], np.flatnonzero(~fits)[-1] + 1 if not fits.all() else 0))
         start = self.dynamics.begin(np.append(fit.pose[first, :2], heading), velocity)
         steps = [Step(start, start, np.eye(len(start.mean)), None, None)]
         for k in range(first + 1, len(samples)):
@@ -306,6 +325,8 @@ class GroundTracker:
                 ended.append(self._trimmed(track, "left the picture"))
             elif scale[k] > self.settings.life.max_scale:
                 ended.append(self._trimmed(track, "left the measurable zone"))
+            elif track.refused_since is not None and self._t - track.refused_since > self.settings.life.max_refused_s:
+                ended.append(self._trimmed(track, "no longer looks like itself"))
             elif self._t - track.last_measured > self.settings.life.max_coast_s:
                 ended.append(self._trimmed(track, "lost"))
             else:

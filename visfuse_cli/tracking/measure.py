@@ -67,7 +67,7 @@ def classify(
         size, size_sigma = common_size(fit, mean, sigma)
         relative = fit.rms / (settings.sigma_px + settings.sigma_share * extent(outlines))
         misfit = float(np.median(relative[fit.ok])) if fit.ok.any() else np.inf
-        cost = 12 * misfit**2 + float(np.sum(((size - mean) / sigma) ** 2 + 2 * np.log(sigma)))
+        cost = 4 * misfit**2 + float(np.sum(((size - mean) / sigma) ** 2 + 2 * np.log(sigma)))
         if best is None or cost < best[0]:
             best = cost, prior, size, size_sigma, fit
     assert best is not None

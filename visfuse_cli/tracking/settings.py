@@ -55,7 +55,7 @@ class PoseSettings(Section):
         0.02, ge=0, le=1, description="noise of a tangent that grows with the outline, as a share of its width"
     )
     bias_px: float = Field(
-        0.3, ge=0, le=20, description="px: outline error that stays over a vehicle's life; widens the speed interval"
+        1.0, ge=0, le=20, description="px: outline error that stays over a vehicle's life; widens the speed interval"
     )
     border_px: float = Field(
         0.5, ge=-5, le=5, description="px: how far a vehicle's true outline lies outside its region's pixel centres"
@@ -83,9 +83,11 @@ class LifeSettings(Section):
     confirm_frames: int = Field(4, ge=3, le=100, description="frames seen before a region can become a track")
     tentative_s: float = Field(6.0, gt=0, le=600, description="s: how long a region may stand before it is given up")
     max_coast_s: float = Field(1.2, gt=0, le=60, description="s: prediction without measurement before a track ends")
-    max_scale: float = Field(
-        0.5, gt=0, le=20, description="m of ground a pixel: further away nothing is tracked (horizon)"
+    max_refused_s: float = Field(
+        0.4, gt=0, le=60, description="s: measurements outside the gate in a row before a track ends"
     )
+    birth_scale: float = Field(0.3, gt=0, le=20, description="m of ground a pixel: further away no track starts")
+    max_scale: float = Field(0.5, gt=0, le=20, description="m of ground a pixel: further away nothing is tracked")
 
 
 class TrackerSettings(Section):

@@ -24,6 +24,7 @@ class SpeedSettings(Section):
     max_sigma: float = Field(0.15, gt=0, le=10, description="standard deviation over speed: above, too uncertain")
     max_acceleration: float = Field(9.0, gt=0, le=100, description="m/s^2: above, the track has jumped")
     max_misfit: float = Field(0.2, gt=0, le=5, description="outline misfit over outline size: above, no such box")
+    max_size_z: float = Field(4.0, gt=0, le=100, description="deviations of a size from its class: above, no such thing")
     max_refused: float = Field(
         0.5, gt=0, le=1, description="share of measurements outside the gate: above, inconsistent"
     )
@@ -109,6 +110,9 @@ def _reason(path: Path, verdict: Verdict, settings: SpeedSettings) -> str:
         return f"jump: speed changes by more than {excess:.0f} m/s^2"
     if refused > settings.max_refused:
         return f"inconsistent: {100 * refused:.0f} % of the measurements outside the gate"
+    if path.size_z > settings.max_size_z:
+        length, width, height = path.size
+        return f"no {path.class_name} measures {length:.1f} x {width:.1f} x {height:.1f} m: a part of something, or several"
     outline = _outline_px(path)
     if np.isfinite(path.misfit_px) and path.misfit_px > settings.max_misfit * outline + 3:
         return f"no box fits: outline off by {path.misfit_px:.0f} px (several vehicles, a shadow or a reflection)"

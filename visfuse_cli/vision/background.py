@@ -11,8 +11,9 @@ from visfuse_cli.records import Array, Image
 
 FOREGROUND, SHADOW = 255, 127
 BINS = 64  # of the ratio of a pixel to the background, from 0 to 1
-SHADOW_REACH = 5  # bins either side of the shadows' own ratio: sensor noise and texture
-SHADOW_SHARE = 0.6  # of all shadow pixels that must lie within reach before the rest is called paint
+SHADOW_REACH = 4  # bins either side of the shadows' own ratio: sensor noise and texture
+SUN_LIMIT = 0.8  # shadows of the sun are darker than this
+DARKER_SHARE, LIGHTER_SHARE = 0.2, 0.7  # of all shadow pixels within reach, to call darker or lighter ones paint
 SHADOW_MEMORY = 0.995  # a frame: clouds come and go
 LEARN_EVERY = 4  # frames: learning costs as much as looking
 
@@ -68,9 +69,10 @@ class Background:
 
 
 class _ShadowDepth:
-    """How dark this recording's shadows are: all cast by one sun, they share one ratio to the lit ground.
+    """How dark this recording's cast shadows are: one sun casts them all, they share one ratio to the lit ground.
 
-    Where most of what the model calls shadow lies in a narrow band of ratios, the rest of it is grey paint.
+    Where that ratio stands out, what is darker is no shadow but a tyre, a bumper or dark paint, and where nearly all
+    shadow has it, what is lighter is grey paint.
     """
 
     def __init__(self) -> None:
@@ -84,11 +86,17 @@ class _ShadowDepth:
         lit = np.maximum(picture[at].sum(axis=1, dtype=np.int32), 1)
         level = np.minimum(image[at].sum(axis=1, dtype=np.int32) * BINS // lit, BINS - 1)
         self._histogram = SHADOW_MEMORY * self._histogram + np.bincount(level, minlength=BINS)
-        near = np.convolve(self._histogram, np.ones(2 * SHADOW_REACH + 1), mode="same")
-        peak = int(np.argmax(near))
-        if near[peak] > SHADOW_SHARE * self._histogram.sum():
-            other = np.abs(level - peak) > SHADOW_REACH
-            labels[at[0][other], at[1][other]] = FOREGROUND
+        near = np.convolve(self._histogram, np.ones(2 * SHADOW_REACH + 1), mode="same") / self._histogram.sum()
+        modes = (near[1:-1] >= near[:-2]) & (near[1:-1] >= near[2:]) & (near[1:-1] > DARKER_SHARE)
+        modes[int(SUN_LIMIT * BINS) :] = False
+        if not modes.any():
+            return  # the even light of a cloudy sky: no ratio stands out
+        peak = int(np.flatnonzero(modes)[-1]) + 1  # the lightest: tyres and bumpers are darker than shadows
+        share = near[peak]
+        paint = level < peak - SHADOW_REACH
+        if share > LIGHTER_SHARE:
+            paint |= level > peak + SHADOW_REACH
+        labels[at[0][paint], at[1][paint]] = FOREGROUND
 
 
 def median_picture(images: Iterable[Image]) -> Image:

@@ -2,103 +2,156 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from visfuse_cli.maths.calibration_error import speed_error
-from visfuse_cli.maths.homography import apply, depth
+from visfuse_cli.maths.homography import apply, depth, invert
 from visfuse_cli.records import Array, GroundMap, Image
 from visfuse_cli.vision import drawing
 from visfuse_cli.vision.lens import distort_points, undistort_points
 
 LEVELS = (1.0, 2.0, 5.0, 10.0, 20.0)  # km/h
-COLOURS = ((80, 170, 60), (60, 190, 150), (40, 200, 230), (30, 140, 245), (50, 60, 230), (60, 30, 120))  # BGR
+COLOURS = ((70, 190, 40), (40, 220, 180), (0, 225, 255), (0, 140, 255), (40, 40, 240), (130, 0, 110))  # BGR
+TINT = 0.36  # share of the colour over the picture
+WHITE, RED, PALE = (255, 255, 255), (70, 70, 255), (235, 235, 235)
 EXAGGERATION = 10  # residuals are drawn this much longer
+FAR = 20  # picture widths: ground lines further out are not drawn
 
 
-def draw(image: Image, ground: GroundMap, marks: Array, world: Array, used: Array, sigma_px: float) -> Image:
-    """Draw on a frame (H, W, 3): grid in metres, points or lines (marks (N, 2 or 4) px, world (N, 2 or 4) m) with
-    residuals, dropped ones crossed, and the expected error of 50 km/h over one second as colours."""
+def draw(image: Image, ground: GroundMap, marks: Array, world: Array, used: NDArray[np.bool_], sigma_px: float) -> Image:
+    """Draw on a copy of a frame (H, W, 3) what H.json promises there.
+
+    The grid in metres; points or lines (marks (N, 2 or 4) px, world (N, 2 or 4) m) with their residuals, dropped ones
+    in red; and as colours the standard deviation of 50 km/h measured over one second with `sigma_px` of noise.
+    """
     out = _error_colours(image, ground, sigma_px)
     _grid(out, ground, world.reshape(-1, 2))
-    width = drawing.stroke(out)
     for index, mark in enumerate(marks):
-        colour = (255, 255, 255) if used[index] else (60, 60, 255)
-        ends = mark.reshape(-1, 2)
         mapped = _to_image(ground, world[index].reshape(-1, 2))
-        if len(ends) == 1:
-            drawing.polyline(
-                out, np.stack([ends[0], ends[0] + EXAGGERATION * (mapped[0] - ends[0])]), colour, width=width
-            )
-            cv2.circle(out, tuple(np.round(ends[0]).astype(int).tolist()), 3 * width, colour, width, cv2.LINE_AA)
-        else:
-            drawing.polyline(out, ends, colour, width=2 * width)
-        label = f"{index + 1}" if used[index] else f"{index + 1} dropped"
-        drawing.label(out, label, ends[0] + 4.0 * width, colour, 0.8)
-    _legend(out)
+        _mark(out, index, mark.reshape(-1, 2), mapped, bool(used[index]))
+    _legend(out, sigma_px)
     return out
 
 
 def _to_image(ground: GroundMap, world: Array) -> Array:
     """Ground points (N, 2) m to the footage's pixels; NaN beyond the horizon."""
-    pixels = apply(np.linalg.inv(ground.ground_from_image), world)
-    pixels[depth(ground.ground_from_image, pixels) * ground.ground_sign <= 0] = np.nan
+    with np.errstate(all="ignore"):
+        pixels = apply(invert(ground.ground_from_image), world)
+    pixels[~(depth(ground.ground_from_image, pixels) * ground.ground_sign > 0)] = np.nan
     if ground.lens is not None:
-        pixels = distort_points(pixels, ground.lens)
+        # far outside of the picture the lens polynomial folds back into it
+        pixels[np.abs(pixels).max(axis=1) > 4 * np.abs(ground.lens.K).max()] = np.nan
+        seen = np.isfinite(pixels).all(axis=1)
+        if seen.any():
+            pixels[seen] = distort_points(pixels[seen], ground.lens)
     return pixels
 
 
 def _error_colours(image: Image, ground: GroundMap, sigma_px: float) -> Image:
+    """The frame tinted by the expected error, with the levels' borders; dark above the horizon."""
     height, width = image.shape[:2]
     step = max(1, height // 180)
-    v, u = np.mgrid[0:height:step, 0:width:step]
+    v, u = np.mgrid[0 : height + step : step, 0 : width + step : step]
     pixels = np.column_stack([u.ravel(), v.ravel()]).astype(float)
     if ground.lens is not None:
         pixels = undistort_points(pixels, ground.lens)
     error = speed_error(ground, pixels, sigma_px).reshape(u.shape)
-    level = np.searchsorted(LEVELS, np.nan_to_num(error, nan=np.inf))
+    known = _enlarged(np.isfinite(error).astype(np.float32), step, image) > 0.5
+    error = _enlarged(np.nan_to_num(np.log(error), nan=9.0).astype(np.float32), step, image)
+    level = np.searchsorted(np.log(LEVELS), error).astype(np.uint8)
     colours = np.array(COLOURS, dtype=np.uint8)[level]
-    colours = cv2.resize(colours, (width, height), interpolation=cv2.INTER_NEAREST)
-    known = cv2.resize(np.isfinite(error).astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST)
-    out = np.asarray(cv2.addWeighted(image, 0.68, colours, 0.32, 0), dtype=np.uint8)
-    out[known == 0] = (image[known == 0] * 0.5).astype(np.uint8)
+    out = (image * (1 - TINT) + colours * TINT).astype(np.uint8)
+    border = cv2.morphologyEx(level, cv2.MORPH_GRADIENT, np.ones((1 + drawing.stroke(image),) * 2, np.uint8)) > 0
+    out[border] = colours[border]
+    out[~known] = (image[~known] * 0.45).astype(np.uint8)
     return out
 
 
+def _enlarged(coarse: NDArray[np.float32], step: int, image: Image) -> NDArray[np.float32]:
+    """Values at every step-th pixel, interpolated to all pixels of the picture."""
+    height, width = image.shape[:2]
+    shrink = np.array([[1 / step, 0, 0], [0, 1 / step, 0]])
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    return np.asarray(cv2.warpAffine(coarse, shrink, (width, height), flags=flags), dtype=np.float32)
+
+
 def _grid(out: Image, ground: GroundMap, world: Array) -> None:
-    """Lines of equal X and Y over the surveyed area and half as much around it."""
+    """Lines of equal X and Y over the surveyed area and half as much around it, each with its metres."""
     low, high = world.min(axis=0), world.max(axis=0)
     margin = 0.5 * (high - low).max()
     raw = ((high - low).max() + 2 * margin) / 12
-    spacing = next(m * 10.0**e for e in range(-3, 6) for m in (1, 2, 5) if m * 10.0**e >= raw)
+    spacing = next(m * 10.0**e for e in range(-6, 12) for m in (1, 2, 5) if m * 10.0**e >= raw)
     low, high = np.floor((low - margin) / spacing), np.ceil((high + margin) / spacing)
+    labels: list[tuple[str, Array]] = []
     for axis in (0, 1):
         for number in np.arange(low[axis], high[axis] + 1):
             other = np.linspace(low[1 - axis], high[1 - axis], 200) * spacing
             line = np.empty((len(other), 2))
             line[:, axis], line[:, 1 - axis] = number * spacing, other
-            pixels = _to_image(ground, line)
-            near = np.isfinite(pixels).all(axis=1) & (np.abs(pixels) < 20 * max(out.shape)).all(axis=1)
-            for piece in np.split(pixels, np.flatnonzero(np.diff(near)) + 1):
-                if np.isfinite(piece).all() and np.abs(piece).max() < 20 * max(out.shape):
-                    drawing.polyline(out, piece, (235, 235, 235))
-            shown = pixels[near & (pixels >= 0).all(axis=1) & (pixels < out.shape[1::-1]).all(axis=1)]
-            if len(shown):
-                drawing.label(
-                    out, f"{'XY'[axis]} {number * spacing:g} m", shown[len(shown) // 2], (235, 235, 235), 0.65
-                )
+            inside = _grid_line(out, _to_image(ground, line))
+            if len(inside):
+                # X near the end of its lines and Y near the middle, where they seldom meet
+                place = inside[len(inside) // (2 if axis else 8)]
+                labels.append((f"{'XY'[axis]} {number * spacing + 0:g} m", place))
+    taken: list[Array] = []
+    room = np.array([0.11, 0.04]) * out.shape[0]
+    for text, place in labels:
+        if all(np.any(np.abs(place - other) > room) for other in taken):
+            taken.append(place)
+            drawing.label(out, text, place, PALE, 0.65)
 
 
-def _legend(out: Image) -> None:
-    bounds = (0.0, *LEVELS)
-    text = (
-        [f"< {LEVELS[0]:g}"]
-        + [f"{a:g}-{b:g}" for a, b in zip(bounds[1:], bounds[2:], strict=False)]
-        + [f"> {LEVELS[-1]:g}"]
-    )
-    line = max(14, out.shape[0] // 28)
-    drawing.label(out, "sigma of 50 km/h over 1 s, km/h", np.array([line * 0.4, line * 1.1]), (255, 255, 255), 0.8)
-    for k, (name, colour) in enumerate(zip(text, COLOURS, strict=True)):
-        drawing.label(out, name, np.array([line * 0.4, line * (2.3 + k)]), colour, 0.8)
-    note = f"residuals x{EXAGGERATION}"
-    drawing.label(out, note, np.array([line * 0.4, line * (2.3 + len(text))]), (255, 255, 255), 0.8)
+def _grid_line(out: Image, pixels: Array) -> Array:
+    """Draw what is visible of a line (k, 2) px; the points of it that lie inside the picture."""
+    size = np.array(out.shape[1::-1])
+    with np.errstate(invalid="ignore"):
+        near = (np.abs(pixels) < FAR * size).all(axis=1)
+        inside = near & (pixels >= 0).all(axis=1) & (pixels < size).all(axis=1)
+    cuts = [0, *(np.flatnonzero(np.diff(near)) + 1), len(near)]
+    for start, end in pairwise(cuts):
+        if near[start]:
+            drawing.polyline(out, pixels[start:end], PALE)
+    return pixels[inside]
+
+
+def _mark(out: Image, index: int, ends: Array, mapped: Array, used: bool) -> None:
+    """A point with its residual, or a line with the mapped world line's ends, and its number in the table."""
+    width, colour = drawing.stroke(out), WHITE if used else RED
+    drawing.label(out, f"{index + 1}" if used else f"{index + 1} dropped", ends[0] + 8.0 * width, colour, 0.7)
+    if len(ends) == 1:
+        drawing.polyline(out, np.stack([ends[0], ends[0] + EXAGGERATION * (mapped[0] - ends[0])]), colour, width=width)
+        _circle(out, ends[0], 4 * width, colour)
+        return
+    drawing.polyline(out, ends, colour, width=2 * width)
+    if not np.isfinite(mapped).all():
+        return
+    along = (mapped[1] - mapped[0]) / max(float(np.hypot(*(mapped[1] - mapped[0]))), 1e-9)
+    across = np.array([-along[1], along[0]])
+    for end in ends:
+        drawing.polyline(out, np.stack([end, end + EXAGGERATION * ((mapped[0] - end) @ across) * across]), colour)
+        _circle(out, end, 3 * width, colour)
+
+
+def _circle(out: Image, at: Array, radius: int, colour: drawing.Colour) -> None:
+    if np.abs(at).max() < 2 * max(out.shape):
+        centre = tuple(np.round(at).astype(int).tolist())
+        cv2.circle(out, centre, radius, (0, 0, 0), drawing.stroke(out) + 2, cv2.LINE_AA)
+        cv2.circle(out, centre, radius, colour, drawing.stroke(out), cv2.LINE_AA)
+
+
+def _legend(out: Image, sigma_px: float) -> None:
+    """The colours and what they mean, in the upper left corner."""
+    names = [f"< {LEVELS[0]:g}", *(f"{a:g} - {b:g}" for a, b in pairwise(LEVELS)), f"> {LEVELS[-1]:g}"]
+    line = max(16, out.shape[0] // 28)
+    lines = ["50 km/h over 1 s: sigma, km/h", *names, f"picking noise {sigma_px:g} px", f"residuals x{EXAGGERATION}"]
+    for k, text in enumerate(lines):
+        foot = np.array([line * 0.4, line * (1.1 + k)])
+        if 0 < k <= len(names):
+            corner, far = (foot - [0, 0.65 * line]).astype(int), (foot + [1.4 * line, 0.15 * line]).astype(int)
+            cv2.rectangle(out, tuple(corner.tolist()), tuple(far.tolist()), COLOURS[k - 1], -1)
+            foot = foot + [1.8 * line, 0]
+        drawing.label(out, text, foot, WHITE, 0.75)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from visfuse_cli.maths.cameras import project
 from visfuse_cli.maths.homography import apply
 from visfuse_cli.records import Array, GroundCamera, Image, Lens, Region
-from visfuse_cli.vision.background import FOREGROUND, SHADOW
+from visfuse_cli.vision.background import FOREGROUND
 from visfuse_cli.vision.lens import undistort_points
 
 
@@ -49,25 +49,16 @@ def bands(camera: GroundCamera) -> list[Band]:
     return [Band(int(a), int(b), float(2 ** (octave[a] / 2))) for a, b in zip(starts, ends, strict=True)]
 
 
-def _vehicle_mask(labels: Image, cut: list[Band], gap_m: float, bridge_m: float, speck_m: float) -> Image:
-    """Foreground without specks, its gaps closed up to `gap_m`, and up to `bridge_m` where they are labelled shadow.
-
-    A grey car on a grey road is half labelled shadow: what lies between its foreground parts is the car.
-    """
+def _vehicle_mask(labels: Image, cut: list[Band], gap_m: float, speck_m: float) -> Image:
+    """Foreground without specks, its gaps closed up to `gap_m`."""
     out = np.empty_like(labels)
     for band in cut:
-        opening, closing, bridging = (_kernel(size * band.scale) for size in (speck_m, gap_m, bridge_m))
-        margin = max(len(closing), len(opening), len(bridging))
+        opening, closing = (_kernel(size * band.scale) for size in (speck_m, gap_m))
+        margin = max(len(closing), len(opening))
         top, bottom = max(0, band.top - margin), min(len(labels), band.bottom + margin)
-        strip = labels[top:bottom]
-        mask = cv2.morphologyEx(cv2.compare(strip, FOREGROUND, cv2.CMP_EQ), cv2.MORPH_OPEN, opening)
-        if not cv2.hasNonZero(mask):
-            out[band.top : band.bottom] = 0
-            continue
-        bridge = cv2.bitwise_and(
-            cv2.morphologyEx(mask, cv2.MORPH_CLOSE, bridging), cv2.compare(strip, SHADOW, cv2.CMP_EQ)
-        )
-        mask = cv2.morphologyEx(cv2.bitwise_or(mask, bridge), cv2.MORPH_CLOSE, closing)
+        mask = cv2.compare(labels[top:bottom], FOREGROUND, cv2.CMP_EQ)
+        mask = cv2.morphologyEx(mask, cv2.MORPH_OPEN, opening)
+        mask = cv2.morphologyEx(mask, cv2.MORPH_CLOSE, closing)
         out[band.top : band.bottom] = mask[band.top - top : band.bottom - top]
     return out
 
@@ -78,13 +69,13 @@ def _kernel(size: float) -> Image:
 
 
 def find(
-    labels: Image, cut: list[Band], gap_m: float, bridge_m: float, speck_m: float, smallest_m: float
+    labels: Image, cut: list[Band], gap_m: float, speck_m: float, smallest_m: float
 ) -> list[Region]:
     """Regions of a labelled picture (255 foreground, 127 shadow): connected, at least `smallest_m` tall or wide.
 
     Lengths are metres at each band's scale; hulls run through pixel centres.
     """
-    mask = _vehicle_mask(labels, cut, gap_m, bridge_m, speck_m)
+    mask = _vehicle_mask(labels, cut, gap_m, speck_m)
     contours, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
     height, width = mask.shape
     scale = np.concatenate([np.full(band.bottom - band.top, band.scale) for band in cut])
