@@ -56,7 +56,7 @@ class Gaussian:
 
 @dataclass(frozen=True, slots=True)
 class Innovation:
-    """What a measurement said about a prediction: residual (..., m), its cov (..., m, m), nis and log-likelihood (...)."""
+    """What a measurement said about a prediction: residual (..., m), cov (..., m, m), nis and log-likelihood (...)."""
 
     residual: Array
     cov: Array

@@ -244,7 +244,9 @@ def _doubts(survey: Survey, size: Size | None, config: CalibrateConfig) -> list[
     """What a person should know before trusting this calibration."""
     noun, fit, doubts = survey.noun, survey.fit, []
     for k in map(int, np.flatnonzero(~fit.used)):
-        doubts.append(f"{noun} {k + 1} disagrees with the others by {fit.error_m[k]:.1f} m on the ground and was dropped")
+        doubts.append(
+            f"{noun} {k + 1} disagrees with the others by {fit.error_m[k]:.1f} m on the ground and was dropped"
+        )
     if fit.used.sum() < FEW:
         doubts.append(f"{int(fit.used.sum())} {noun}s leave little to check them with; six or more are better")
     for k in map(int, np.flatnonzero(fit.leave_one_out_m > config.limits.leave_one_out_m)):

@@ -113,7 +113,7 @@ class _Clip:
 
 
 def run(request: RunRequest) -> RunResult:
-    """Measure every recording of `request.input`; raises a VisfuseError before the first frame where an input is bad."""
+    """Measure every recording of `request.input`; raises a VisfuseError before the first frame on bad input."""
     config: SpeedConfig = request.config
     ground = _ground_map(request.options["homography"])
     several = is_clip_folder(request.input)
@@ -300,7 +300,7 @@ def _settle(
             results.speeds.append(verdict.speed)
             run_.count("vehicles")
     for candidate in abandoned:
-        if len(candidate.samples) >= SEEN_FRAMES:
+        if candidate.position is not None and len(candidate.samples) >= SEEN_FRAMES:
             results.rejected.append(abandoned_row(candidate, clip.name, _utc(begun, candidate.samples[0].t)))
         run_.count("regions that never became a track")
 
@@ -371,8 +371,9 @@ def text(result: RunResult) -> str:
     lines.append(f"{'rejected':<12} {summary['rejected']} (reasons in rejected.csv)")
     for name, audit in summary["time_audit"].items():
         lines.append(
-            f"{'times':<12} {name}: {audit['frames']} frames over {audit['duration_s']:.2f} s, {audit['dropped']} dropped, "
-            f"{audit['irregular']} irregular, {audit['duplicated']} duplicated, {audit['lost']} lost"
+            f"{'times':<12} {name}: {audit['frames']} frames over {audit['duration_s']:.2f} s, "
+            f"{audit['dropped']} dropped, {audit['irregular']} irregular, "
+            f"{audit['duplicated']} duplicated, {audit['lost']} lost"
         )
     lines.append(f"{'results':<12} {summary['out']}")
     return "\n".join(lines)

@@ -19,13 +19,14 @@ def speed_error(ground: GroundMap, pixels: Array, sigma_px: float) -> Array:
     H = ground.ground_from_image
     out = np.full(len(pixels), np.nan)
     seen = depth(H, pixels) * ground.ground_sign > 1e-9
-    middle = apply(H, pixels[seen])
+    middle: Array = apply(H, pixels[seen])
     worst = np.zeros(len(middle))
-    image_from_ground = np.linalg.inv(H)
+    image_from_ground: Array = np.asarray(np.linalg.inv(H))
     way = SPEED_KMH / 3.6 * DURATION_S
     for angle in np.arange(4) * np.pi / 4:
-        along = np.array([np.cos(angle), np.sin(angle)])
-        ends = [apply(image_from_ground, middle + side * way / 2 * along) for side in (-1, 1)]
+        along: Array = np.array([np.cos(angle), np.sin(angle)])
+        half = np.asarray(way / 2 * along)
+        ends = [apply(image_from_ground, middle - half), apply(image_from_ground, middle + half)]
         # an end beyond the horizon leaves no measurement in this direction
         visible = np.all([depth(H, end) * ground.ground_sign > 0 for end in ends], axis=0)
         pull = np.einsum("d,ndh->nh", along, entry_jacobian(H, ends[1]) - entry_jacobian(H, ends[0]))

@@ -42,7 +42,7 @@ def ground_camera(ground: GroundMap, image_size: tuple[int, int]) -> GroundCamer
 
 
 def _centre(frontal: Array, normal: Array) -> Array:
-    return -np.linalg.solve(np.column_stack([frontal[:, 0], frontal[:, 1], normal]), frontal[:, 2])
+    return np.asarray(-np.linalg.solve(np.column_stack([frontal[:, 0], frontal[:, 1], normal]), frontal[:, 2]))
 
 
 def _focal_length(ground: GroundMap, image_size: tuple[int, int]) -> float:
@@ -86,7 +86,7 @@ def project(camera: GroundCamera, points: Array) -> tuple[Array, Array]:
 
 
 def ground_scale(camera: GroundCamera, points: Array) -> Array:
-    """Metres of ground (...) under one pixel, in the worst direction, at image points (..., 2); inf above the horizon."""
+    """Metres of ground (...) under a pixel in the worst direction at image points (..., 2); inf above the horizon."""
     H = camera.ground.ground_from_image
     homogeneous = points @ H[:, :2].T + H[:, 2]
     w = homogeneous[..., 2:] * camera.ground.ground_sign

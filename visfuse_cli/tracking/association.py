@@ -78,22 +78,23 @@ def claim(regions: list[Region], reach: Array, join_share: float = np.inf) -> Cl
     belongs = ((inside >= INSIDE) | (covered >= COVERED) | (iou >= 0.2)) & ~shared[:, None]
     pairs, loose, _ = assign(np.where(belongs, 1 - iou, np.inf))
     parts = {int(thing): [int(r)] for r, thing in pairs}
-    for r in loose:
+    for r in (int(each) for each in loose):
         thing = int(np.argmax(inside[r]))
         if inside[r, thing] >= INSIDE and not shared[r] and thing in parts:
             main = boxes[parts[thing][0]]
             gap = np.max(np.maximum(main[:2] - boxes[r, 2:], boxes[r, :2] - main[2:]))
             if gap <= join_share * np.max(main[2:] - main[:2]):
-                parts[thing].append(int(r))
+                parts[thing].append(r)
     everywhere = np.ones(DIRECTIONS, dtype=bool)
     for thing, members in parts.items():
         of[thing] = Claim(region_tools.joined([regions[r] for r in members]), everywhere)
         used[members] = True
-    for r in np.flatnonzero(shared):
-        together = np.flatnonzero(covered[r] >= COVERED)
+    for wide in np.flatnonzero(shared):
+        r = int(wide)
+        together = [int(each) for each in np.flatnonzero(covered[r] >= COVERED)]
         for thing in together:
             if of[thing] is None:
-                others = np.max(reach[together[together != thing]], axis=0)
+                others = np.max(reach[[other for other in together if other != thing]], axis=0)
                 of[thing] = Claim(regions[r], reach[thing] > others + OWN_PX)
                 used[r] = True
     return Claims(of, used, np.any((inside >= 0.3) | (covered >= COVERED), axis=1))

@@ -20,7 +20,6 @@ from visfuse_cli.tracking.ground import Sample, Track
 from visfuse_cli.tracking.settings import TrackerSettings
 from visfuse_cli.vision.wireframe import Outlines
 
-
 START_DOUBT = 5.0  # times the deviations a new track begins with
 
 
@@ -52,7 +51,7 @@ class Path:
 
 
 def conclude(track: Track, camera: GroundCamera, settings: TrackerSettings, dynamics: Dynamics) -> Path:
-    """Settle a track's size, fit every frame again with it, and smooth; with `smooth` off, take the causal filter's word."""
+    """Settle a track's size, fit every frame again with it, and smooth; with `smooth` off, keep the causal states."""
     samples, steps, size, misfit = track.samples, track.steps, track.size, np.nan
     nis = _nis(steps)
     class_name = track.prior_class.name

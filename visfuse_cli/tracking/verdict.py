@@ -24,7 +24,7 @@ class SpeedSettings(Section):
     max_sigma: float = Field(0.15, gt=0, le=10, description="standard deviation over speed: above, too uncertain")
     max_acceleration: float = Field(9.0, gt=0, le=100, description="m/s^2: above, the track has jumped")
     max_misfit: float = Field(0.2, gt=0, le=5, description="outline misfit over outline size: above, no such box")
-    max_size_z: float = Field(4.0, gt=0, le=100, description="deviations of a size from its class: above, no such thing")
+    max_size_z: float = Field(4.0, gt=0, le=100, description="deviations of a size from its class")
     max_refused: float = Field(
         0.5, gt=0, le=1, description="share of measurements outside the gate: above, inconsistent"
     )
@@ -33,7 +33,7 @@ class SpeedSettings(Section):
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """A stretch [first, last] of a path: mean speed and deviation (m/s), its parts, way (m), course (rad), reason or ''."""
+    """A stretch [first, last] of a path: mean speed and deviation (m/s), way (m), course (rad), reason or ''."""
 
     first: int
     last: int
@@ -112,17 +112,18 @@ def _reason(path: Path, verdict: Verdict, settings: SpeedSettings) -> str:
         return f"inconsistent: {100 * refused:.0f} % of the measurements outside the gate"
     if path.size_z > settings.max_size_z:
         length, width, height = path.size
-        return f"no {path.class_name} measures {length:.1f} x {width:.1f} x {height:.1f} m: a part of something, or several"
+        return f"no {path.class_name} measures {length:.1f} x {width:.1f} x {height:.1f} m: a part, or several"
     outline = _outline_px(path)
     if np.isfinite(path.misfit_px) and path.misfit_px > settings.max_misfit * outline + 3:
         return f"no box fits: outline off by {path.misfit_px:.0f} px (several vehicles, a shadow or a reflection)"
     if verdict.sigma > settings.max_sigma * abs(verdict.speed):
-        return f"too uncertain: {verdict.speed * 3.6:.0f} +- {verdict.sigma * Z95 * 3.6:.0f} km/h, outside the trusted zone"
+        half = verdict.sigma * Z95 * 3.6
+        return f"too uncertain: {verdict.speed * 3.6:.0f} +- {half:.0f} km/h, outside the trusted zone"
     return ""
 
 
 def _jump(path: Path, verdict: Verdict) -> float:
-    """The largest change of speed (m/s^2) on the stretch that its uncertainty does not explain, over a third of a second."""
+    """The largest change of speed (m/s^2) over 0.3 s of the stretch that its uncertainty does not explain."""
     stretch = slice(verdict.first, verdict.last + 1)
     t, velocity = path.t[stretch], path.planar.mean[stretch, 2:]
     speed = np.linalg.norm(velocity, axis=1)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from typing import Any
 
 import cv2
 import numpy as np
@@ -26,6 +27,7 @@ class Background:
     """
 
     def __init__(self, kind: str, threshold: float, shadow_ratio: float) -> None:
+        model: Any
         if kind == "mog2":
             model = cv2.createBackgroundSubtractorMOG2(500, threshold, True)
         else:

@@ -22,7 +22,9 @@ EXAGGERATION = 10  # residuals are drawn this much longer
 FAR = 20  # picture widths: ground lines further out are not drawn
 
 
-def draw(image: Image, ground: GroundMap, marks: Array, world: Array, used: NDArray[np.bool_], sigma_px: float) -> Image:
+def draw(
+    image: Image, ground: GroundMap, marks: Array, world: Array, used: NDArray[np.bool_], sigma_px: float
+) -> Image:
     """Draw on a copy of a frame (H, W, 3) what H.json promises there.
 
     The grid in metres; points or lines (marks (N, 2 or 4) px, world (N, 2 or 4) m) with their residuals, dropped ones
@@ -109,7 +111,7 @@ def _grid_line(out: Image, pixels: Array) -> Array:
     """Draw what is visible of a line (k, 2) px; the points of it that lie inside the picture."""
     size = np.array(out.shape[1::-1])
     with np.errstate(invalid="ignore"):
-        near = (np.abs(pixels) < FAR * size).all(axis=1)
+        near: NDArray[np.bool_] = np.asarray((np.abs(pixels) < FAR * size).all(axis=1))
         inside = near & (pixels >= 0).all(axis=1) & (pixels < size).all(axis=1)
     cuts = [0, *(np.flatnonzero(np.diff(near)) + 1), len(near)]
     for start, end in pairwise(cuts):

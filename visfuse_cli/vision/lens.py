@@ -7,12 +7,16 @@ import numpy as np
 
 from visfuse_cli.records import Array, Lens
 
+POLISH = 20
+
 
 def undistort_points(points: Array, lens: Lens) -> Array:
     """Pixels (N, 2) of the footage to pixels (N, 2) of a camera with the same K and no distortion."""
-    criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-10)
     shaped = np.ascontiguousarray(points, dtype=float).reshape(-1, 1, 2)
-    return np.asarray(cv2.undistortPointsIter(shaped, lens.K, lens.D, np.eye(3), lens.K, criteria)).reshape(-1, 2)
+    straight = np.asarray(cv2.undistortPoints(shaped, lens.K, lens.D, None, None, lens.K), dtype=float).reshape(-1, 2)
+    for _ in range(POLISH):  # OpenCV stops after five rounds; strong lenses want more
+        straight = straight - (distort_points(straight, lens) - points)
+    return straight
 
 
 def distort_points(points: Array, lens: Lens) -> Array:

@@ -68,9 +68,7 @@ def _kernel(size: float) -> Image:
     return np.ones((side, side), np.uint8)
 
 
-def find(
-    labels: Image, cut: list[Band], gap_m: float, speck_m: float, smallest_m: float
-) -> list[Region]:
+def find(labels: Image, cut: list[Band], gap_m: float, speck_m: float, smallest_m: float) -> list[Region]:
     """Regions of a labelled picture (255 foreground, 127 shadow): connected, at least `smallest_m` tall or wide.
 
     Lengths are metres at each band's scale; hulls run through pixel centres.

@@ -121,7 +121,7 @@ def fit(
     seen = valid.sum(axis=1)
     rms = np.sqrt(np.sum(np.where(valid, residual**2, 0), axis=1) / np.maximum(seen, 1))
     ok = (seen >= 3) & np.all(np.isfinite(x), axis=1)
-    return BoxFit(x[:, :3], x[:, 3:], np.linalg.inv(N), rms, ok)
+    return BoxFit(x[:, :3], x[:, 3:], np.asarray(np.linalg.inv(N)), rms, ok)
 
 
 def silhouette(camera: GroundCamera, pose: Array, size: Array) -> Array:
