@@ -58,7 +58,7 @@ def _error_colours(image: Image, ground: GroundMap, sigma_px: float) -> Image:
     height, width = image.shape[:2]
     step = max(1, height // 180)
     v, u = np.mgrid[0 : height + step : step, 0 : width + step : step]
-    pixels = np.column_stack([u.ravel(), v.ravel()]).astype(float)
+    pixels = np.column_stack([np.minimum(u.ravel(), width - 1), np.minimum(v.ravel(), height - 1)]).astype(float)
     if ground.lens is not None:
         pixels = undistort_points(pixels, ground.lens)
     error = speed_error(ground, pixels, sigma_px).reshape(u.shape)

@@ -57,7 +57,7 @@ def snap(image: Image, lines: Array, radius_px: float) -> tuple[Array, NDArray[n
     """
     pieces = trace(image)
     grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
-    gx, gy = _gradient(cv2.GaussianBlur(grey, (0, 0), 0.8))
+    gx, gy = _gradient(cv2.GaussianBlur(grey, (0, 0), 0.6))
     snapped, found = lines.copy(), np.zeros(len(lines), dtype=bool)
     for k, line in enumerate(lines):
         edge = _edge_under(line, pieces, radius_px)
@@ -101,10 +101,12 @@ def _refined(edge: Array, gx: Array, gy: Array) -> tuple[Array, Array]:
         normal = np.array([-direction[1], direction[0]])
         at = centre + ((edge - centre) @ direction)[:, None] * direction
         samples = (at[:, None] + reach[:, None] * normal).astype(np.float32)
-        slope = np.abs(
+        slope = (
             cv2.remap(gx, samples, None, cv2.INTER_LINEAR) * normal[0]
             + cv2.remap(gy, samples, None, cv2.INTER_LINEAR) * normal[1]
         )
+        # the other edge of a thin painted line slopes the other way, and has no say
+        slope = np.maximum(slope * np.sign(np.median(slope[:, abs(reach) < 1])), 0)
         slope = np.clip(slope - 0.3 * slope.max(axis=1, keepdims=True), 0, None) ** 2
         weight = slope.sum(axis=1)
         offset = (slope @ reach) / np.maximum(weight, 1e-9)
