@@ -19,6 +19,8 @@ GROUND_FROM_IMAGE = np.linalg.inv(TRUE) / np.linalg.inv(TRUE)[2, 2]
 # a court of painted lines on the ground: X1, Y1, X2, Y2
 COURT = np.array([[-5, 12, -5, 40], [5, 12, 5, 40], [-5, 14, 5, 14], [-5, 38, 5, 38], [-5, 26, 5, 26], [0, 14, 3, 38]])
 
+pytestmark = pytest.mark.geometry
+
 
 def survey(n: int, seed: int = 0, noise: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
     rng = np.random.default_rng(seed)

@@ -90,9 +90,9 @@ def _numbers(
             raise InputError(f"{where}, column {name}: {cell[:40]!r} is not a number")
         value = float(cell)
         if not math.isfinite(value):
-            raise InputError(f"{where}, column {name}: {cell} is not a finite number")
+            raise InputError(f"{where}, column {name}: {cell[:40]} is not a finite number")
         if abs(value) >= limits.get(name, BEYOND):
             reason = "rad does not look forward; degrees?" if name in limits else f"is beyond {BEYOND:g}"
-            raise InputError(f"{where}, column {name}: {cell} {reason}")
+            raise InputError(f"{where}, column {name}: {cell[:40]} {reason}")
         values.append(value)
     return values

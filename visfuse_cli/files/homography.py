@@ -35,10 +35,17 @@ def write(path: Path, ground: GroundMap) -> None:
     write_json(path, document)
 
 
+def is_camera_matrix(K: Array) -> bool:
+    """Whether K is [fx 0 cx; 0 fy cy; 0 0 1]; OpenCV's lens model ignores every other entry without a word."""
+    if K.shape != (3, 3) or not np.isfinite(K).all():
+        return False
+    return bool(K[0, 0] > 0 and K[1, 1] > 0 and K[2, 2] == 1 and not np.any(K[[0, 1, 2, 2], [1, 0, 0, 1]]))
+
+
 def read(path: Path) -> GroundMap:
     """Read H.json; raises InputError naming the key that is missing or wrong."""
     try:
-        document = json.loads(Path(path).read_text(encoding="utf-8"))
+        document = json.loads(Path(path).read_text(encoding="utf-8-sig"))
     except OSError as problem:
         raise InputError(f"{path}: cannot read the homography: {problem.strerror or problem}") from problem
     except (ValueError, RecursionError) as problem:  # not UTF-8, not JSON, or a number of thousands of digits
@@ -64,7 +71,7 @@ def read(path: Path) -> GroundMap:
         rms_m=float(_array(path, document, "rms_m", ())),
         rms_px=float(_array(path, document, "rms_px", ())),
         residuals=_residuals(path, document),
-        source=str(document.get("source", "")),
+        source=str(document.get("source") or ""),
     )
 
 
@@ -77,12 +84,13 @@ def _get(path: Path, document: dict[str, Any], key: str) -> Any:
 def _array(path: Path, document: dict[str, Any], key: str, shape: tuple[int, ...]) -> Array:
     value = _get(path, document, key)
     try:
-        array = np.array(value, dtype=float)
+        array = np.array(value)
+        array = array.astype(float) if array.dtype.kind in "iuf" else np.array(np.nan)  # "1" and true are not
     except (TypeError, ValueError, OverflowError):
         array = np.array(np.nan)
     if array.shape != shape or not np.isfinite(array).all():
-        wanted = "x".join(map(str, shape)) + " numbers" if shape else "a number"
-        raise InputError(f'{path}: "{key}" must be {wanted}, all finite')
+        wanted = "x".join(map(str, shape)) + " finite numbers" if shape else "a finite number"
+        raise InputError(f'{path}: "{key}" must be {wanted}')
     return array
 
 
@@ -100,7 +108,7 @@ def _size(path: Path, document: dict[str, Any]) -> tuple[int, int] | None:
     value = document.get("image_size")
     if value is None:
         return None
-    if not (isinstance(value, list) and len(value) == 2 and all(isinstance(v, int) and v > 0 for v in value)):
+    if not (isinstance(value, list) and len(value) == 2 and all(type(v) is int and v > 0 for v in value)):
         raise InputError(f'{path}: "image_size" must be [width, height] in pixels, or null')
     return value[0], value[1]
 
@@ -112,7 +120,7 @@ def _lens(path: Path, document: dict[str, Any]) -> Lens | None:
     if not isinstance(value, dict):
         raise InputError(f'{path}: "lens" must be {{"K": 3x3, "D": coefficients}}, or null')
     K = _array(path, value, "K", (3, 3))
-    if not (K[0, 0] > 0 and K[1, 1] > 0 and K[2, 2] == 1):
+    if not is_camera_matrix(K):
         raise InputError(f'{path}: "lens.K" is not a camera matrix [fx 0 cx; 0 fy cy; 0 0 1]')
     coefficients = _get(path, value, "D")
     count = len(coefficients) if isinstance(coefficients, list) else 0

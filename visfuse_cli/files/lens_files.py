@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -9,11 +10,12 @@ import cv2
 import numpy as np
 
 from visfuse_cli.errors import InputError
-from visfuse_cli.files.homography import COEFFICIENTS
+from visfuse_cli.files.homography import COEFFICIENTS, is_camera_matrix
 from visfuse_cli.records import Lens
 
 NAMES = (("M1", "D1"), ("camera_matrix", "distortion_coefficients"), ("K", "D"))
 LARGEST = 10_000_000  # bytes: calibration files with all their board corners stay below
+LONGEST = 1_000_000  # px
 Size = tuple[int, int]
 
 
@@ -27,19 +29,17 @@ def read_lens(path: Path) -> tuple[Lens, Size | None]:
         storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
         found = next((pair for pair in NAMES if all(not storage.getNode(name).empty() for name in pair)), None)
         K, D = (_matrix(storage.getNode(name)) for name in found or ("", ""))
-        size = _size(storage)
+        sides = _sides(storage)
     except (cv2.error, SystemError, TypeError, ValueError) as problem:
         raise InputError(f"{path}: not a readable OpenCV calibration file") from problem
     if found is None:
         raise InputError(f"{path}: has neither M1 and D1 nor camera_matrix and distortion_coefficients")
-    if K.shape != (3, 3) or not np.isfinite(K).all() or not (K[0, 0] > 0 and K[1, 1] > 0 and K[2, 2] == 1):
+    if not is_camera_matrix(K):
         raise InputError(f"{path}: {found[0]} is not a camera matrix [fx 0 cx; 0 fy cy; 0 0 1]")
     if D.size not in COEFFICIENTS or not np.isfinite(D).all():
         known = ", ".join(map(str, COEFFICIENTS))
         raise InputError(f"{path}: {found[1]} must be {known} finite coefficients")
-    if size is not None and min(size) <= 0:
-        raise InputError(f"{path}: the image size {size[0]}x{size[1]} is none")
-    return Lens(K, D.ravel()), size
+    return Lens(K, D.ravel()), _size(path, sides)
 
 
 def _text(path: Path) -> str:
@@ -65,9 +65,17 @@ def _matrix(node: Any) -> np.ndarray:
     return np.zeros((0, 0)) if value is None else np.asarray(value, dtype=float)
 
 
-def _size(storage: Any) -> Size | None:
+def _sides(storage: Any) -> list[float]:
+    """Width and height as the file has them, or nothing; NaN for what is no number."""
     sides = [storage.getNode(name) for name in ("image_width", "image_height")]
     if not any(side.empty() for side in sides):
-        return int(sides[0].real()), int(sides[1].real())
-    pair = _matrix(storage.getNode("image_size")).ravel()
-    return (int(pair[0]), int(pair[1])) if pair.size == 2 else None
+        return [side.real() if side.isInt() or side.isReal() else math.nan for side in sides]
+    pair: list[float] = _matrix(storage.getNode("image_size")).ravel().tolist()
+    return pair if len(pair) == 2 else []
+
+
+def _size(path: Path, sides: list[float]) -> Size | None:
+    if not all(1 <= side <= LONGEST and side == int(side) for side in sides):
+        width, height = sides
+        raise InputError(f"{path}: the image size {width:g}x{height:g} is none; whole pixels are needed")
+    return (int(sides[0]), int(sides[1])) if sides else None
