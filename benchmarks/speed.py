@@ -50,7 +50,13 @@ def compare(name: str, rival: Callable[[], object], ours: Callable[[], object], 
     pairs = [(seconds(rival), seconds(ours)) for _ in range(PAIRS)]
     a, b = (statistics.median(side) for side in zip(*pairs, strict=True))
     ratio = statistics.median(ours_s / rival_s for rival_s, ours_s in pairs)
-    print(f"{name:<42} {a:>9.2f} s {b:>9.2f} s {ratio:>8.2f}   {goal}")
+    print(row(name, "s", a, b, goal, ratio))
+
+
+def row(name: str, unit: str, rival: float, ours: float, goal: str, ratio: float | None = None) -> str:
+    """One line of the table."""
+    ratio = ours / rival if ratio is None else ratio
+    return f"{name:<42} {rival:>9.2f} {unit:<2} {ours:>9.2f} {unit:<2} {ratio:>7.2f}   {goal}"
 
 
 def process(*command: str) -> int:
@@ -122,9 +128,7 @@ def main() -> None:
         compare("background, bare MOG2", background_bare, background_ours, "")
         compare("H.264 out, cv2 mp4v", write_mp4v, write_ours, "at most 0.67")
         sizes = [(folder / f"{who}.mp4").stat().st_size for who in ("rival", "ours")]
-        print(
-            f"{'  file size':<42} {sizes[0] / 1e6:>8.2f} MB {sizes[1] / 1e6:>8.2f} MB {sizes[1] / sizes[0]:>8.2f}   below 1"
-        )
+        print(row("  file size", "MB", sizes[0] / 1e6, sizes[1] / 1e6, "below 1"))
 
         def bare() -> int:
             return process(sys.executable, "-c", BARE, str(clip))
@@ -133,9 +137,7 @@ def main() -> None:
         compare("whole speed run with video", bare, speed, "")
         print(f"{'  the footage lasts':<42} {48.0:>9.2f} s")
         short, long = speed("--no-video", "--end", "12"), speed("--no-video")
-        print(
-            f"{'peak memory, 300 against 1200 frames':<42} {short / 1e3:>8.1f} MB {long / 1e3:>8.1f} MB {long / short:>8.2f}   1.05"
-        )
+        print(row("peak memory, 300 against 1200 frames", "MB", short / 1e3, long / 1e3, "at most 1.05"))
 
 
 if __name__ == "__main__":

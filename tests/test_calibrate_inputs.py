@@ -229,7 +229,7 @@ def test_bad_h_json_is_refused_by_key(tmp_path: Path, change: dict[str, Any], me
 def test_what_is_no_h_json_at_all(tmp_path: Path, content: bytes):
     path = tmp_path / "H.json"
     path.write_bytes(content)
-    with pytest.raises(InputError, match="not JSON|not a homography") as refusal:
+    with pytest.raises(InputError, match=r"not JSON|not a homography") as refusal:
         homography_files.read(path)
     assert "\n" not in str(refusal.value)
 

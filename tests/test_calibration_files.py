@@ -174,7 +174,7 @@ NAN, EYE = float("nan"), np.eye(3).tolist()
         ({"image_size": [0, 720]}, '"image_size" must be'),
         ({"image_size": [True, True]}, '"image_size" must be'),
         ({"image_size": "1280x720"}, '"image_size" must be'),
-        ({"input": "angles"}, "\"input\" is 'angles'; it must be \"pixel\" or \"gaze\""),
+        ({"input": "angles"}, '"input" is \'angles\'; it must be "pixel" or "gaze"'),
         ({"ground_sign": 0}, '"ground_sign" is 0; it must be 1 or -1'),
         ({"ground_sign": True}, '"ground_sign" is True; it must be 1 or -1'),
         ({"lens": []}, '"lens" must be'),

@@ -170,13 +170,13 @@ def test_folder_of_clips(scene, tmp_path):
 
 def test_external_detections(scene, measured, tmp_path):
     tracks = json.loads((measured / "tracks.json").read_text())["tracks"]
-    rows = [
+    boxes = [
         f"{state['frame'] + 1},-1,{','.join(f'{v:.2f}' for v in state['box']['image'])},1\n"
         for track in tracks
         if track["summary"]["rejected"] is None
         for state in track["states"]
     ]
-    (tmp_path / "boxes.txt").write_text("".join(rows))
+    (tmp_path / "boxes.txt").write_text("".join(boxes))
     options = ("--homography", scene / "H.json", "--detections", tmp_path / "boxes.txt", "--no-video")
     run("speed", scene / "clip.mp4", *options, "--out", tmp_path / "run")
     ours = [float(r["speed_kmh"]) for r in rows(measured / "speeds.csv")]

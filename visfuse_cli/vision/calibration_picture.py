@@ -17,7 +17,7 @@ from visfuse_cli.vision.lens import distort_points, undistort_points
 LEVELS = (1.0, 2.0, 5.0, 10.0, 20.0)  # km/h
 COLOURS = ((70, 190, 40), (40, 220, 180), (0, 225, 255), (0, 140, 255), (40, 40, 240), (130, 0, 110))  # BGR
 TINT = 0.36  # share of the colour over the picture
-WHITE, RED, PALE = (255, 255, 255), (70, 70, 255), (235, 235, 235)
+WHITE, RED, PALE = (255, 255, 255), (90, 90, 255), (235, 235, 235)
 EXAGGERATION = 10  # residuals are drawn this much longer
 FAR = 20  # picture widths: ground lines further out are not drawn
 
@@ -101,8 +101,9 @@ def _grid(out: Image, ground: GroundMap, world: Array) -> None:
                 labels.append((f"{'XY'[axis]} {number * spacing + 0:g} m", place))
     taken: list[Array] = []
     room = np.array([0.11, 0.04]) * out.shape[0]
+    legend = np.array([0.3, 0.36]) * out.shape[0]
     for text, place in labels:
-        if all(np.any(np.abs(place - other) > room) for other in taken):
+        if np.any(place > legend) and all(np.any(np.abs(place - other) > room) for other in taken):
             taken.append(place)
             drawing.label(out, text, place, PALE, 0.65)
 
@@ -123,19 +124,24 @@ def _grid_line(out: Image, pixels: Array) -> Array:
 def _mark(out: Image, index: int, ends: Array, mapped: Array, used: bool) -> None:
     """A point with its residual, or a line with the mapped world line's ends, and its number in the table."""
     width, colour = drawing.stroke(out), WHITE if used else RED
-    drawing.label(out, f"{index + 1}" if used else f"{index + 1} dropped", ends[0] + 8.0 * width, colour, 0.7)
     if len(ends) == 1:
         drawing.polyline(out, np.stack([ends[0], ends[0] + EXAGGERATION * (mapped[0] - ends[0])]), colour, width=width)
         _circle(out, ends[0], 4 * width, colour)
-        return
-    drawing.polyline(out, ends, colour, width=2 * width)
+    else:
+        drawing.polyline(out, ends, colour, width=2 * width)
+        _line_residuals(out, ends, mapped, colour)
+    drawing.label(out, f"{index + 1}" if used else f"{index + 1} dropped", ends[0] + 8.0 * width, colour, 0.75)
+
+
+def _line_residuals(out: Image, ends: Array, mapped: Array, colour: drawing.Colour) -> None:
+    """How far the two points of a drawn line (2, 2) px lie from the mapped world line, through mapped (2, 2) px."""
     if not np.isfinite(mapped).all():
         return
     along = (mapped[1] - mapped[0]) / max(float(np.hypot(*(mapped[1] - mapped[0]))), 1e-9)
     across = np.array([-along[1], along[0]])
     for end in ends:
         drawing.polyline(out, np.stack([end, end + EXAGGERATION * ((mapped[0] - end) @ across) * across]), colour)
-        _circle(out, end, 3 * width, colour)
+        _circle(out, end, 3 * drawing.stroke(out), colour)
 
 
 def _circle(out: Image, at: Array, radius: int, colour: drawing.Colour) -> None:

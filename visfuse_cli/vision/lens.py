@@ -40,7 +40,9 @@ def distort_points(points: Array, lens: Lens) -> Array:
 
 def _rays(points: Array, lens: Lens) -> Array:
     """Ray directions (N, 2) at unit depth through undistorted pixels (N, 2)."""
-    return np.linalg.solve(lens.K[:2, :2], (np.asarray(points, dtype=float) - lens.K[:2, 2]).T).T
+    return np.asarray(
+        np.linalg.solve(lens.K[:2, :2], (np.asarray(points, dtype=float) - lens.K[:2, 2]).T).T, dtype=float
+    )
 
 
 def _project(rays: Array, lens: Lens) -> tuple[Array, Array]:
