@@ -15,6 +15,8 @@ from visfuse_cli.maths.homography_fit import fit_points
 from visfuse_cli.records import GroundMap, Lens
 from visfuse_cli.vision.lens import distort_points, undistort_points
 
+pytestmark = pytest.mark.geometry
+
 ROWS = "u,v,X,Y\n1,2,3,4\n5,6,7,8\n"
 K = np.array([[900.0, 0, 640], [0, 910, 360], [0, 0, 1]])
 YAML = """%YAML:1.0

@@ -13,6 +13,7 @@ from visfuse_cli.records import Array
 from visfuse_cli.tracking.conclude import Path
 
 Z95 = 1.959964
+GOOD_ENOUGH, LONGER_FOR = 0.01, 1.5  # standard deviation of a speed over itself
 
 
 class SpeedSettings(Section):
@@ -45,10 +46,10 @@ class Verdict:
 
 
 def judge(path: Path, entry_cov: Array, bias_px: float, settings: SpeedSettings) -> Verdict:
-    """Measure the mean speed over the stretch where it is known best relative to itself, and test the track.
+    """Measure the mean speed over the longest stretch on which it is known well, and test the track.
 
-    The stretch's ends may lie anywhere on the measured path that leaves it long enough; pose noise shrinks with
-    length, calibration doubt grows away from the surveyed points, and the stretch balances the two.
+    The stretch's ends may lie anywhere on the measured path; pose noise counts less with length, calibration doubt
+    grows away from the surveyed points. Well known is a doubt of GOOD_ENOUGH, or LONGER_FOR times the least.
     """
     position, velocity = path.planar.mean[:, :2], path.planar.mean[:, 2:]
     tangent = velocity / np.maximum(np.linalg.norm(velocity, axis=1, keepdims=True), 1e-6)
@@ -90,7 +91,9 @@ def _best_stretch(
     bias = bias_px**2 * np.sum((slip[j] - slip[i]) ** 2, axis=1)
     stamps = 2 * (distance / np.maximum(duration, 1e-9) * settings.sigma_t_s) ** 2
     sigma_way = np.sqrt(pose + np.clip(calibration, 0, None) + bias + stamps)
-    best = int(np.argmin(sigma_way / np.maximum(distance, 1e-3)))
+    doubt = sigma_way / np.maximum(distance, 1e-3)
+    good = doubt <= max(LONGER_FOR * float(doubt.min()), GOOD_ENOUGH)
+    best = int(np.argmax(np.where(good, distance, -np.inf)))
     return int(i[best]), int(j[best]), float(sigma_way[best] / max(duration[best], 1e-9))
 
 
