@@ -1,7 +1,5 @@
 """`speed` on rendered traffic through the real command, against the renderer's truth."""
 
-import csv
-import json
 import subprocess
 import sys
 from pathlib import Path
@@ -11,6 +9,7 @@ import pytest
 
 from samples.files import write_scene
 from samples.road import free_flow
+from samples.score import matches, rows
 
 DATA = Path(__file__).parents[2] / "shared" / "data"
 
@@ -19,34 +18,6 @@ def visfuse(*args):
     done = subprocess.run([sys.executable, "-m", "visfuse_cli", *map(str, args)], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     return done.stdout
-
-
-def rows(path):
-    with open(path, newline="") as file:
-        return list(csv.DictReader(file))
-
-
-def matches(run, truth):
-    """For each row: itself, the true mean speed over its own stretch, the share of time within 2 m, the vehicle."""
-    tracks = {track["id"]: track for track in json.loads((run / "tracks.json").read_text())["tracks"]}
-    true = {}
-    for row in rows(truth):
-        true.setdefault(int(row["id"]), []).append([float(row[k]) for k in ("t", "x", "y", "vx", "vy")])
-    found = []
-    for row in rows(run / "speeds.csv"):
-        states = tracks[int(row["track_id"])]["states"]
-        t = np.array([s["t"] for s in states])
-        xy = np.array([s["position"] for s in states])
-        best = (0.0, None, np.nan)
-        for vehicle, values in true.items():
-            v = np.array(values)
-            at = [np.interp(v[:, 0], t, xy[:, k], left=np.nan, right=np.nan) for k in (0, 1)]
-            share = float(np.mean(np.hypot(at[0] - v[:, 1], at[1] - v[:, 2]) < 2))
-            if share > best[0]:
-                inside = (v[:, 0] >= float(row["t_start"]) - 1e-6) & (v[:, 0] <= float(row["t_end"]) + 1e-6)
-                best = (share, vehicle, float(np.hypot(v[inside, 3], v[inside, 4]).mean() * 3.6))
-        found.append((row, best[2], best[0], best[1]))
-    return found
 
 
 @pytest.fixture(scope="module")
