@@ -245,7 +245,10 @@ class _MovingRegions:
 
 def _sampled(source: VideoSource, warmup_s: float) -> Iterator[Any]:
     """Pictures spread over the first `warmup_s` seconds; the first picture at least."""
-    step = max(1, round(warmup_s * source.nominal_rate / WARMUP_PICTURES))
+    span = warmup_s * source.nominal_rate
+    if source.frame_count is not None:
+        span = min(span, source.frame_count)
+    step = max(1, round(span / WARMUP_PICTURES))
     first: float | None = None
     for number, frame in enumerate(source.frames()):
         first = frame.t if first is None else first
