@@ -11,7 +11,18 @@ import numpy as np
 from samples.drives import cruise, queue
 from samples.fleet import clear_of, random_vehicle
 from samples.junction import crossing_traffic
-from samples.scene import Array, Camera, Light, Placement, Road, Scene, Trajectory, Vehicle, share_inside
+from samples.scene import (
+    NEAREST_DEPTH,
+    Array,
+    Camera,
+    Light,
+    Placement,
+    Road,
+    Scene,
+    Trajectory,
+    Vehicle,
+    share_inside,
+)
 
 SCENE_STREAM, POINT_STREAM = 0, 4
 FAR_END, NEAR_END = 170.0, -25.0
@@ -75,28 +86,36 @@ KINDS: dict[str, Callable[..., Scene]] = {"free-flow": free_flow, "dense": dense
 def calibration_points(
     scene: Scene, n: int = 10, noise_px: float = 0.4, near: float = 15, far: float = 50
 ) -> list[tuple[float, float, float, float]]:
-    """n rows u, v (px, with noise), X, Y (world m) over the road between `near` and `far` m ahead of the camera.
+    """n rows u, v (px, with noise), X, Y (world m), spread over the road between `near` and `far` m from the camera.
 
     Raises ValueError when the camera does not see that stretch.
     """
     rng = np.random.default_rng((scene.seed, POINT_STREAM))
     left, right = scene.road.edges
-    rows = []
-    for index, ahead in enumerate(near * (far / near) ** np.linspace(0, 1, n)):
-        for _ in range(200):
-            # left, right, middle in turn, so that the points span the road at every distance
-            share = (0.06, 0.94, 0.5)[index % 3] + rng.uniform(-0.06, 0.06)
-            point = scene.placement.points(np.array([[left + share * (right - left), ahead + rng.uniform(-1, 1)]]))
-            u, v = scene.camera.project(np.array([[*point[0], 0.0]]))[0]
-            if 8 <= u < scene.camera.size[0] - 8 and 8 <= v < scene.camera.size[1] - 8:
-                break
-            left, right = (left + 0.02 * (right - left), right - 0.02 * (right - left))
-        else:
-            raise ValueError(f"the camera does not see the road {ahead:.0f} m ahead")
-        left, right = scene.road.edges
-        du, dv = rng.normal(0, noise_px, 2)
-        rows.append((float(u + du), float(v + dv), float(point[0, 0]), float(point[0, 1])))
-    return rows
+    inset = 0.04 * (right - left)
+    on_road = np.column_stack([rng.uniform(left + inset, right - inset, 20000), rng.uniform(-60, 60, 20000)])
+    camera, ground = scene.camera, scene.placement.points(on_road + [0, _along(scene)])
+    distance = np.linalg.norm(ground - camera.centre[:2], axis=1)
+    raised = np.column_stack([ground, np.zeros(len(ground))])
+    ahead = (distance > near) & (distance < far) & (camera.depth(raised) > NEAREST_DEPTH)
+    ground, pixels = ground[ahead], camera.project(raised[ahead])
+    seen = np.all((pixels >= 8) & (pixels < np.array(camera.size) - 8), axis=1)
+    ground, pixels = ground[seen], pixels[seen]
+    if len(ground) < 10 * n:
+        raise ValueError(f"the camera hardly sees the road between {near:.0f} and {far:.0f} m")
+    # each next point is the one furthest in the picture from those before it, as a surveyor spreads them
+    chosen = [int(np.argmax(pixels[:, 1]))]
+    gap = np.full(len(pixels), np.inf)
+    while len(chosen) < n:
+        gap = np.minimum(gap, np.linalg.norm(pixels - pixels[chosen[-1]], axis=1))
+        chosen.append(int(np.argmax(gap)))
+    noisy = pixels[chosen] + rng.normal(0, noise_px, (n, 2))
+    return [(float(u), float(v), float(x), float(y)) for (u, v), (x, y) in zip(noisy, ground[chosen], strict=True)]
+
+
+def _along(scene: Scene) -> float:
+    """Where along the road the camera stands, m."""
+    return float(((scene.camera.centre[:2] - scene.placement.offset) @ scene.placement.rotation)[1])
 
 
 def _random_road(rng: np.random.Generator) -> Road:
@@ -106,15 +125,20 @@ def _random_road(rng: np.random.Generator) -> Road:
     return Road(tuple(lanes), width)
 
 
-def _random_view(rng: np.random.Generator, road: Road, size: tuple[int, int]) -> tuple[Camera, Placement]:
-    """A camera 6-9 m over or beside the road at y = 0; the picture's upper edge meets the ground 80-100 m ahead."""
+def _random_view(
+    rng: np.random.Generator, road: Road, size: tuple[int, int], slant: float = 60.0
+) -> tuple[Camera, Placement]:
+    """A camera 6-9 m high, 26 m from the middle of the road at y = 26 and up to `slant` degrees aside of its course.
+
+    The picture's upper edge meets the ground 80-100 m ahead.
+    """
     width, height = size
     focal = float(rng.uniform(900, 1400)) * width / 1280
     up = float(rng.uniform(6, 9))
-    left, right = road.edges
-    across = float(rng.uniform(left - 1.5, right + 1.5))
+    angle = np.radians(rng.uniform(-slant, slant))
+    foot = np.array([sum(road.edges) / 2, 26.0]) - 26.0 * np.array([np.sin(angle), np.cos(angle)])
+    yaw = angle + np.radians(rng.uniform(-2, 2))
     pitch = np.arctan2(height / 2, focal) + np.arctan2(up, rng.uniform(80, 100))
-    yaw = np.arctan2((left + right) / 2 - across, 26.0) + np.radians(rng.uniform(-2, 2))
     roll = np.radians(rng.uniform(-1, 1))
     ahead = np.array([np.sin(yaw) * np.cos(pitch), np.cos(yaw) * np.cos(pitch), -np.sin(pitch)])
     level = np.array([np.cos(yaw), -np.sin(yaw), 0.0])
@@ -125,7 +149,7 @@ def _random_view(rng: np.random.Generator, road: Road, size: tuple[int, int]) ->
     road_from_world = np.eye(3)
     road_from_world[:2, :2] = placement.rotation.T
     K = np.array([[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1.0]])
-    centre = np.append(placement.points(np.array([[across, 0.0]]))[0], up)
+    centre = np.append(placement.points(foot[None])[0], up)
     return Camera(K, camera_from_road @ road_from_world, centre, size), placement
 
 

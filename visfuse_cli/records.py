@@ -101,15 +101,7 @@ class Region:
     at_border: NDArray[np.bool_]  # (k,): the frame's edge was seen there and not the thing's own
     area: float
     score: float = 1.0
-
-
-@dataclass(frozen=True, slots=True)
-class Measurement:
-    """z (m,) with covariance R (m, m) at time t (s)."""
-
-    z: Array
-    R: Array
-    t: float
+    upright: bool = False  # a detector's box: only its four sides are the thing's own
 
 
 @dataclass(frozen=True, slots=True)

@@ -25,12 +25,14 @@ from visfuse_cli.files.video import VideoSource, describe, is_clip_folder, list_
 from visfuse_cli.files.video_writer import VideoWriter
 from visfuse_cli.maths.cameras import ground_camera
 from visfuse_cli.pipeline import Run
-from visfuse_cli.records import Array, Frame, GroundCamera, GroundMap, Region, RunRequest, RunResult, TimeAudit
+from visfuse_cli.records import Array, Frame, GroundCamera, GroundMap, RunRequest, RunResult, TimeAudit
 from visfuse_cli.tracking.annotate import UNITS, annotate
 from visfuse_cli.tracking.conclude import conclude
-from visfuse_cli.tracking.ground import Abandoned, GroundTracker, Track
+from visfuse_cli.tracking.evidence import BoxEvidence, Evidence, LabelEvidence
+from visfuse_cli.tracking.ground import GroundTracker
 from visfuse_cli.tracking.output import COLUMNS, abandoned_row, lane_of, row_of, track_record
 from visfuse_cli.tracking.settings import TrackerSettings
+from visfuse_cli.tracking.targets import Abandoned, Track
 from visfuse_cli.tracking.verdict import SpeedSettings, judge
 from visfuse_cli.vision import regions as region_tools
 from visfuse_cli.vision.background import Background, median_picture
@@ -195,15 +197,15 @@ def _check_size(source: VideoSource, ground: GroundMap, path: Path) -> None:
 
 def _track(clip: _Clip, run_: Run, spool: TrackSpool, results: _Results, first_id: int, label: str | None) -> int:
     """Follow everything in one clip; returns the next free id."""
-    tracker = GroundTracker(clip.camera, clip.config, first_id, upright=clip.boxes is not None)
+    tracker = GroundTracker(clip.camera, clip.config, first_id)
     results.drawn[clip.name] = []
     look = _Detections(clip) if clip.boxes is not None else _MovingRegions(clip, run_)
     for frame in run_.frames(clip.source):
         with run_.stage("detect"):
-            regions = look.regions(frame)
+            evidence = look.evidence(frame)
         with run_.stage("track"):
             tracker.predict(frame.t)
-            ended = tracker.update(frame.index, regions)
+            ended = tracker.update(frame.index, evidence)
         with run_.stage("conclude"):
             _settle(*ended, clip, tracker, run_, spool, results, label)
         with run_.stage("learn"):
@@ -228,12 +230,10 @@ class _MovingRegions:
             self._background.start(median_picture(_sampled(clip.source, settings.warmup_s)))
         self._t = 0.0
 
-    def regions(self, frame: Frame) -> list[Region]:
+    def evidence(self, frame: Frame) -> Evidence:
         labels = self._background.detect(frame.image)
         settings, smallest = self._clip.config.regions, self._clip.config.target.smallest
-        found = region_tools.find(labels, self._bands, settings.gap, settings.speck, smallest)
-        lens = self._clip.camera.ground.lens
-        return found if lens is None else [region_tools.undistorted(region, lens) for region in found]
+        return LabelEvidence(labels, self._clip.camera, self._bands, settings.gap, settings.speck, smallest)
 
     def learn(self, frame: Frame, followed: list[Array]) -> None:
         elapsed, self._t = max(frame.t - self._t, 0.0), frame.t
@@ -263,13 +263,15 @@ class _Detections:
 
     def __init__(self, clip: _Clip) -> None:
         self._boxes = clip.boxes or {}
-        self._size = clip.camera.image_size
+        self._camera = clip.camera
         self._lens = clip.camera.ground.lens
 
-    def regions(self, frame: Frame) -> list[Region]:
+    def evidence(self, frame: Frame) -> Evidence:
         rows = self._boxes.get(frame.index, np.zeros((0, 5)))
-        found = [region_tools.from_box(row[:4], row[4], self._size) for row in rows]
-        return found if self._lens is None else [region_tools.undistorted(region, self._lens) for region in found]
+        found = [region_tools.from_box(row[:4], row[4], self._camera.image_size) for row in rows]
+        if self._lens is not None:
+            found = [region_tools.undistorted(region, self._lens) for region in found]
+        return BoxEvidence(found, self._camera)
 
     def learn(self, frame: Frame, followed: list[Array]) -> None:
         """Boxes from outside need no background."""

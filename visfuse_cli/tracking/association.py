@@ -1,8 +1,6 @@
-"""Which region belongs to which followed thing, decided by the outlines predicted for them."""
+"""Which region belongs to which watched candidate."""
 
 from __future__ import annotations
-
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,31 +8,11 @@ from numpy.typing import NDArray
 from visfuse_cli.maths.assignment import assign
 from visfuse_cli.records import Array, Region
 from visfuse_cli.vision import regions as region_tools
-from visfuse_cli.vision.wireframe import DIRECTIONS, FAN
 
-INSIDE = 0.6  # share of a region inside a predicted box that makes it a part of that thing
-COVERED = 0.5  # share of a predicted box under one region that makes the thing a part of that region
-OWN_PX = 2.0  # lead that makes a tangent of a shared region one thing's own
-
-
-@dataclass(frozen=True, slots=True)
-class Claim:
-    """The region a thing is seen as, and which of its tangents (K,) are the thing's own."""
-
-    region: Region
-    own: np.ndarray
-
-
-def boxes_of(reach: Array) -> Array:
-    """Upright boxes [x0, y0, x1, y1] (N, 4) of tangents (N, K)."""
-    quarter = DIRECTIONS // 4
-    return np.stack([-reach[:, 2 * quarter], -reach[:, 3 * quarter], reach[:, 0], reach[:, quarter]], axis=1)
-
-
-def reach_of(boxes: Array) -> Array:
-    """Tangents (N, K) of upright boxes [x0, y0, x1, y1] (N, 4)."""
-    corners = boxes[:, [[0, 1], [2, 1], [0, 3], [2, 3]]]
-    return np.asarray(np.max(corners @ FAN.T, axis=1))
+INSIDE = 0.6  # share of a region inside an expected box that makes it a part of that thing
+COVERED = 0.5  # share of an expected box under one region that makes the thing a part of that region
+LEAST_IOU = 0.2
+FRAGMENT_GAP = 0.25  # of a region's size: parts of one vehicle lie closer together, two vehicles mostly apart
 
 
 def overlap(first: Array, second: Array) -> tuple[Array, Array, Array]:
@@ -53,29 +31,19 @@ def region_boxes(regions: list[Region]) -> Array:
     return np.concatenate([boxes[:, :2], boxes[:, :2] + boxes[:, 2:]], axis=1)
 
 
-@dataclass(frozen=True, slots=True)
-class Claims:
-    """One claim (or none) a thing; which regions (R,) were given out, and which lie where a thing is (also unused)."""
+def claim(regions: list[Region], expected: Array) -> tuple[list[Region | None], NDArray[np.bool_]]:
+    """Give regions to the things expected in boxes [x0, y0, x1, y1] (T, 4), one to one; and which were given out.
 
-    of: list[Claim | None]
-    used: NDArray[np.bool_]
-    near: NDArray[np.bool_]
-
-
-def claim(regions: list[Region], reach: Array, join_share: float = np.inf) -> Claims:
-    """Give regions to the things whose tangents are predicted as `reach` (T, K), one to one.
-
-    Fragments inside one prediction are joined when the gap to its region is below `join_share` of that region's size;
-    a region over several predictions is shared, each thing keeping only the tangents where it lies outermost.
+    Fragments inside one box are joined when they lie close together; a region over several boxes is given to none.
     """
     used = np.zeros(len(regions), dtype=bool)
-    of: list[Claim | None] = [None] * len(reach)
-    if not len(regions) or not len(reach):
-        return Claims(of, used, used.copy())
+    given: list[Region | None] = [None] * len(expected)
+    if not len(regions) or not len(expected):
+        return given, used
     boxes = region_boxes(regions)
-    iou, inside, covered = overlap(boxes, boxes_of(reach))
+    iou, inside, covered = overlap(boxes, expected)
     shared = np.sum(covered >= COVERED, axis=1) > 1
-    belongs = ((inside >= INSIDE) | (covered >= COVERED) | (iou >= 0.2)) & ~shared[:, None]
+    belongs = ((inside >= INSIDE) | (covered >= COVERED) | (iou >= LEAST_IOU)) & ~shared[:, None]
     pairs, loose, _ = assign(np.where(belongs, 1 - iou, np.inf))
     parts = {int(thing): [int(r)] for r, thing in pairs}
     for r in (int(each) for each in loose):
@@ -83,21 +51,12 @@ def claim(regions: list[Region], reach: Array, join_share: float = np.inf) -> Cl
         if inside[r, thing] >= INSIDE and not shared[r] and thing in parts:
             main = boxes[parts[thing][0]]
             gap = np.max(np.maximum(main[:2] - boxes[r, 2:], boxes[r, :2] - main[2:]))
-            if gap <= join_share * np.max(main[2:] - main[:2]):
+            if gap <= FRAGMENT_GAP * np.max(main[2:] - main[:2]):
                 parts[thing].append(r)
-    everywhere = np.ones(DIRECTIONS, dtype=bool)
     for thing, members in parts.items():
-        of[thing] = Claim(region_tools.joined([regions[r] for r in members]), everywhere)
+        given[thing] = region_tools.joined([regions[r] for r in members])
         used[members] = True
-    for wide in np.flatnonzero(shared):
-        r = int(wide)
-        together = [int(each) for each in np.flatnonzero(covered[r] >= COVERED)]
-        for thing in together:
-            if of[thing] is None:
-                others = np.max(reach[[other for other in together if other != thing]], axis=0)
-                of[thing] = Claim(regions[r], reach[thing] > others + OWN_PX)
-                used[r] = True
-    return Claims(of, used, np.any((inside >= 0.3) | (covered >= COVERED), axis=1))
+    return given, used
 
 
 def footprint_contains(outer_pose: Array, outer_size: Array, point: Array) -> bool:

@@ -16,8 +16,8 @@ from visfuse_cli.records import Array, Gaussian, GroundCamera
 from visfuse_cli.tracking import dynamics as dynamics_tools
 from visfuse_cli.tracking import measure
 from visfuse_cli.tracking.dynamics import Dynamics, Step
-from visfuse_cli.tracking.ground import Sample, Track
 from visfuse_cli.tracking.settings import TrackerSettings
+from visfuse_cli.tracking.targets import Sample, Track
 from visfuse_cli.vision.wireframe import Outlines
 
 START_DOUBT = 5.0  # times the deviations a new track begins with
@@ -60,16 +60,10 @@ def conclude(track: Track, camera: GroundCamera, settings: TrackerSettings, dyna
         heading = dynamics.heading(_smooth(steps, dynamics).mean)
         rough = np.stack([step.posterior.mean for step in steps])
         pose = np.column_stack([rough[:, :2], heading])
-        outlines = Outlines(np.stack([s.support for s in samples]), np.stack([s.valid for s in samples]))
+        outlines = Outlines.stack([s.outline for s in samples])
         used = measured
-        prior, size, _, _ = measure.classify(
-            camera,
-            Outlines(outlines.support[used], outlines.valid[used]),
-            pose[used],
-            settings.target.classes,
-            settings.pose,
-        )
-        class_name = prior.name
+        sized = measure.classify(camera, outlines[used], pose[used], settings.target.classes, settings.pose)[0]
+        class_name, size = sized.prior.name, sized.size
         fit = measure.fit_poses(camera, outlines, pose, size, np.full(3, 0.01), settings.pose)
         misfit = float(np.median(fit.rms[used]))
         steps, measured = _filter_again(samples, steps, fit, pose, size, settings, dynamics)

@@ -1,8 +1,11 @@
-"""From tangents to a pose on the ground: class, size and measurement of one thing."""
+"""From outlines to a pose on the ground: class, size and measurement of one thing."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
+from numpy.typing import NDArray
 
 from visfuse_cli.records import Array, GroundCamera
 from visfuse_cli.tracking.settings import PoseSettings, SizePrior
@@ -32,14 +35,12 @@ def fit_poses(
     count = len(pose)
     pose_sigma = np.tile([POSITION_SIGMA, POSITION_SIGMA, heading_sigma], (count, 1))
     size, size_sigma = (np.broadcast_to(a, (count, 3)) for a in (size, size_sigma))
-    sigma_px = settings.sigma_px + settings.sigma_share * extent(outlines)
-    return wireframe.fit(camera, outlines, pose, pose_sigma, size, size_sigma, sigma_px)
+    return wireframe.fit(camera, outlines, pose, pose_sigma, size, size_sigma, noise_of(outlines, settings))
 
 
-def extent(outlines: Outlines) -> Array:
-    """Mean width of N outlines over all directions (N,) px."""
-    half = outlines.support.shape[1] // 2
-    return np.asarray(np.mean(outlines.support[:, :half] + outlines.support[:, half:], axis=1))
+def noise_of(outlines: Outlines, settings: PoseSettings) -> Array:
+    """Noise (N,) px of the rows of N outlines."""
+    return np.asarray(settings.sigma_px + settings.sigma_share * outlines.width)
 
 
 def measurement(fit: BoxFit, index: int, predicted: Array, heading_sigma: float = HEADING_SIGMA) -> tuple[Array, Array]:
@@ -53,25 +54,39 @@ def measurement(fit: BoxFit, index: int, predicted: Array, heading_sigma: float 
     return pose, cov
 
 
+def looks_right(fit: BoxFit, outlines: Outlines) -> NDArray[np.bool_]:
+    """Which (N,) of the fitted boxes look like their outlines."""
+    return np.asarray(fit.rms < np.maximum(6.0, 0.15 * outlines.width))
+
+
+@dataclass(frozen=True, slots=True)
+class Sized:
+    """Outlines of one thing seen as a member of a class: its size (3,) and deviation (3,), the fit, the misfit."""
+
+    prior: SizePrior
+    size: Array
+    size_sigma: Array
+    fit: BoxFit
+    cost: float
+
+
 def classify(
     camera: GroundCamera, outlines: Outlines, pose: Array, classes: tuple[SizePrior, ...], settings: PoseSettings
-) -> tuple[SizePrior, Array, Array, BoxFit]:
-    """The class whose size prior explains N outlines of one thing best, with its size (3,) and deviation (3,).
+) -> list[Sized]:
+    """N outlines of one thing as a member of each class, the class that explains them best first.
 
     The frames of one track share their errors, so that they count as few independent ones.
     """
-    best: tuple[float, SizePrior, Array, Array, BoxFit] | None = None
+    tried = []
     for prior in classes:
         mean, sigma = prior_arrays(prior)
         fit = fit_poses(camera, outlines, pose, mean, sigma, settings, 0.12)
         size, size_sigma = common_size(fit, mean, sigma)
-        relative = fit.rms / (settings.sigma_px + settings.sigma_share * extent(outlines))
+        relative = fit.rms / noise_of(outlines, settings)
         misfit = float(np.median(relative[fit.ok])) if fit.ok.any() else np.inf
         cost = 4 * misfit**2 + float(np.sum(((size - mean) / sigma) ** 2 + 2 * np.log(sigma)))
-        if best is None or cost < best[0]:
-            best = cost, prior, size, size_sigma, fit
-    assert best is not None
-    return best[1:]
+        tried.append(Sized(prior, size, size_sigma, fit, cost))
+    return sorted(tried, key=lambda sized: sized.cost)
 
 
 def common_size(fit: BoxFit, mean: Array, sigma: Array) -> tuple[Array, Array]:

@@ -9,7 +9,7 @@ import numpy as np
 from visfuse_cli.maths.cameras import project
 from visfuse_cli.records import Array, GroundCamera
 from visfuse_cli.tracking.conclude import Path
-from visfuse_cli.tracking.ground import Abandoned
+from visfuse_cli.tracking.targets import Abandoned
 from visfuse_cli.tracking.verdict import Z95, Verdict
 from visfuse_cli.vision import wireframe
 from visfuse_cli.vision.lens import distort_points

@@ -86,8 +86,8 @@ class LifeSettings(Section):
     max_refused_s: float = Field(
         0.4, gt=0, le=60, description="s: measurements outside the gate in a row before a track ends"
     )
-    birth_scale: float = Field(0.3, gt=0, le=20, description="m of ground a pixel: further away no track starts")
-    max_scale: float = Field(0.5, gt=0, le=20, description="m of ground a pixel: further away nothing is tracked")
+    birth_scale: float = Field(0.8, gt=0, le=20, description="m of ground a pixel: further away no track starts")
+    max_scale: float = Field(1.0, gt=0, le=20, description="m of ground a pixel: further away nothing is tracked")
 
 
 class TrackerSettings(Section):

@@ -49,7 +49,7 @@ class Background:
         """Label each pixel of `image` (H, W, 3): 255 foreground, 127 shadow, 0 background, without learning it."""
         labels = np.asarray(self._model.apply(image, learningRate=0.0), dtype=np.uint8)
         if self._picture is not None:
-            self._shadows.relabel(labels, image, self._picture)
+            pass  # self._shadows.relabel(labels, image, self._picture)
         return labels
 
     def learn(self, image: Image, rate: float, followed: Iterable[Array]) -> None:

@@ -14,6 +14,10 @@ from visfuse_cli.records import Array, GroundCamera, Image, Lens, Region
 from visfuse_cli.vision.background import FOREGROUND
 from visfuse_cli.vision.lens import undistort_points
 
+BODY_M = 1.1, 0.9  # width and height of what is a vehicle and no part of one
+CAR_M = 4.5, 2.4  # width and height that the parts of one car can span in the picture
+LEAST_OPENING_PX = 3  # coding noise along edges of the background comes in specks of two
+
 
 @dataclass(frozen=True, slots=True)
 class Band:
@@ -53,7 +57,7 @@ def _vehicle_mask(labels: Image, cut: list[Band], gap_m: float, speck_m: float) 
     """Foreground without specks, its gaps closed up to `gap_m`."""
     out = np.empty_like(labels)
     for band in cut:
-        opening, closing = (_kernel(size * band.scale) for size in (speck_m, gap_m))
+        opening, closing = _kernel(max(speck_m * band.scale, LEAST_OPENING_PX)), _kernel(gap_m * band.scale)
         margin = max(len(closing), len(opening))
         top, bottom = max(0, band.top - margin), min(len(labels), band.bottom + margin)
         mask = cv2.compare(labels[top:bottom], FOREGROUND, cv2.CMP_EQ)
@@ -68,29 +72,75 @@ def _kernel(size: float) -> Image:
     return np.ones((side, side), np.uint8)
 
 
-def find(labels: Image, cut: list[Band], gap_m: float, speck_m: float, smallest_m: float) -> list[Region]:
+def find(
+    labels: Image, cut: list[Band], gap_m: float, speck_m: float, smallest_m: float, explained: Image | None = None
+) -> list[Region]:
     """Regions of a labelled picture (255 foreground, 127 shadow): connected, at least `smallest_m` tall or wide.
 
-    Lengths are metres at each band's scale; hulls run through pixel centres.
+    Lengths are metres at each band's scale; hulls run through pixel centres. What is `explained` (255) belongs to no
+    region; hull points beside it count as on the border.
     """
     mask = _vehicle_mask(labels, cut, gap_m, speck_m)
+    moved = cv2.morphologyEx(cv2.min(labels, 1), cv2.MORPH_OPEN, _kernel(LEAST_OPENING_PX))
+    if explained is not None:
+        cv2.subtract(mask, explained, mask)
+        cv2.subtract(moved, explained, moved)
     contours, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
+    _, component = cv2.connectedComponents(moved, connectivity=4, ltype=cv2.CV_16U)
     height, width = mask.shape
     scale = np.concatenate([np.full(band.bottom - band.top, band.scale) for band in cut])
-    found = []
+    bodies: list[Region] = []
+    parts: dict[int, list[tuple[Region, float]]] = {}  # of one moving component: windows, wheels, bumpers
     for contour in contours:
         x, y, w, h = cv2.boundingRect(contour)
-        if max(w, h) < smallest_m * scale[y + h - 1] or min(w, h) < 2:
+        if min(w, h) < 2:
             continue
         hull = cv2.convexHull(contour).reshape(-1, 2).astype(float)
         box = np.array([x - 0.5, y - 0.5, w, h], dtype=float)
-        found.append(Region(box, hull, at_border(hull, (width, height)), float(cv2.contourArea(contour))))
-    return found
+        border = at_border(hull, (width, height))
+        if explained is not None:
+            border |= _beside(hull, explained)
+        region = Region(box, hull, border, float(cv2.contourArea(contour)))
+        metre = scale[y + h - 1]
+        if w > BODY_M[0] * metre and h > BODY_M[1] * metre:
+            bodies.append(region)
+        else:
+            points = contour.reshape(-1, 2)
+            whose = np.bincount(component[points[:, 1], points[:, 0]])[1:]
+            parts.setdefault(int(np.argmax(whose)) if whose.any() else -1, []).append((region, metre))
+    gathered = [*bodies, *(region for group in parts.values() for region in _gathered(group))]
+    return [
+        region
+        for region in gathered
+        if np.max(region.box[2:]) >= smallest_m * scale[min(int(region.box[1] + region.box[3]), height - 1)]
+    ]
+
+
+def _gathered(parts: list[tuple[Region, float]]) -> list[Region]:
+    """Parts (each with its px per m) that lie in one moving component, joined as long as a car can hold them."""
+    wholes: list[tuple[Region, float]] = []
+    for part, metre in sorted(parts, key=lambda item: -item[0].area):
+        for k, (whole, largest) in enumerate(wholes):
+            both, scale = joined([whole, part]), max(metre, largest)
+            if both.box[2] <= CAR_M[0] * scale and both.box[3] <= CAR_M[1] * scale:
+                wholes[k] = both, scale
+                break
+        else:
+            wholes.append((part, metre))
+    return [whole for whole, _ in wholes]
 
 
 def at_border(hull: Array, frame_size: tuple[int, int]) -> NDArray[np.bool_]:
     """Which hull points (k, 2) px lie on the border of a frame (w, h)."""
     return np.asarray(np.any((hull <= 1.5) | (hull >= np.array(frame_size) - 2.5), axis=1))
+
+
+def _beside(hull: Array, explained: Image) -> NDArray[np.bool_]:
+    """Which hull points (k, 2) px have something explained next to them."""
+    height, width = explained.shape
+    near = hull[:, None].astype(int) + [(i, j) for i in (-2, 0, 2) for j in (-2, 0, 2)]
+    u, v = np.clip(near[..., 0], 0, width - 1), np.clip(near[..., 1], 0, height - 1)
+    return np.asarray(np.any(explained[v, u] > 0, axis=1))
 
 
 def joined(parts: list[Region]) -> Region:
@@ -110,11 +160,11 @@ def from_box(box: Array, score: float, frame_size: tuple[int, int]) -> Region:
     """A region from an external detection box [x, y, w, h] px."""
     x, y, w, h = box
     hull = np.array([[x, y], [x + w, y], [x + w, y + h], [x, y + h]])
-    return Region(np.asarray(box, dtype=float), hull, at_border(hull, frame_size), float(w * h), score)
+    return Region(np.asarray(box, dtype=float), hull, at_border(hull, frame_size), float(w * h), score, True)
 
 
 def undistorted(region: Region, lens: Lens) -> Region:
     """The region as a camera without distortion would see it."""
     hull = undistort_points(region.hull, lens)
     low, high = hull.min(axis=0) - 0.5, hull.max(axis=0) + 0.5
-    return Region(np.concatenate([low, high - low]), hull, region.at_border, region.area, region.score)
+    return Region(np.concatenate([low, high - low]), hull, region.at_border, region.area, region.score, region.upright)

@@ -1,11 +1,13 @@
-"""A vehicle as a box on the ground plane, fitted to the outline of its region (Lou 2002, sec. 2, pose refinement).
+"""A vehicle as a box on the ground plane, fitted to its outline in the image (Lou 2002, sec. 2, pose refinement).
 
-Outline and projected wireframe are compared by their tangents: in each of a fan of image directions, the
-distance from the region's outermost point to the wireframe's tangent line there. All boxes are fitted at once.
+An outline is a set of rows. Each says how far out, along one image direction, a point of the projected wireframe was
+seen: a point on one of its edges (found by `contour.search`), or whichever corner lies outermost (the tangents of a
+region). All boxes are fitted at once.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -18,15 +20,35 @@ DIRECTIONS = 24
 FAN = np.column_stack([np.cos(a := np.arange(DIRECTIONS) * 2 * np.pi / DIRECTIONS), np.sin(a)])  # (K, 2)
 AXES = np.arange(DIRECTIONS) % (DIRECTIONS // 4) == 0  # the four sides of an upright box
 _SIGNS = np.array([[i, j, k] for k in (0, 1) for i in (-1, 1) for j in (-1, 1)], dtype=float)
-EDGES = ((0, 1), (1, 3), (3, 2), (2, 0), (4, 5), (5, 7), (7, 6), (6, 4), (0, 4), (1, 5), (2, 6), (3, 7))
+EDGES = np.array([(0, 1), (1, 3), (3, 2), (2, 0), (4, 5), (5, 7), (7, 6), (6, 4), (0, 4), (1, 5), (2, 6), (3, 7)])
+# The faces that meet in each edge: rear, front, right, left, bottom, top.
+_MEET = np.array([(0, 4), (3, 4), (1, 4), (2, 4), (0, 5), (3, 5), (1, 5), (2, 5), (0, 2), (0, 3), (1, 2), (1, 3)])
 
 
 @dataclass(frozen=True, slots=True)
 class Outlines:
-    """Tangents of N regions: support (N, K) px along FAN, `valid` where the region's own border is seen."""
+    """Rows of N outlines: model point (1 - share) corner[0] + share corner[1] was seen `support` px along `normal`.
 
+    normal (N, K, 2), support (N, K), corner (N, K, 2), share (N, K), valid (N, K): the thing's own border was seen;
+    tangent (N,): the corner is whichever lies outermost; width (N,) px: mean width of the outline. One outline has
+    the same fields without the first axis.
+    """
+
+    normal: Array
     support: Array
+    corner: np.ndarray
+    share: Array
     valid: np.ndarray
+    tangent: np.ndarray
+    width: Array
+
+    def __getitem__(self, which: object) -> Outlines:
+        return Outlines(*(getattr(self, name)[which] for name in self.__dataclass_fields__))
+
+    @staticmethod
+    def stack(outlines: Sequence[Outlines]) -> Outlines:
+        """N outlines as one."""
+        return Outlines(*(np.stack([getattr(o, name) for o in outlines]) for name in Outlines.__dataclass_fields__))
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,6 +60,9 @@ class BoxFit:
     cov: Array
     rms: Array
     ok: np.ndarray
+
+    def __getitem__(self, which: object) -> BoxFit:
+        return BoxFit(*(getattr(self, name)[which] for name in self.__dataclass_fields__))
 
 
 def corners(pose: Array, size: Array) -> Array:
@@ -65,8 +90,28 @@ def _corner_jacobian(pose: Array, size: Array) -> Array:
     return J
 
 
-def outline(hull: Array, at_border: np.ndarray, upright: bool = False) -> tuple[Array, np.ndarray]:
-    """Support (K,) of a hull (k, 2) px in the fan's directions, and where it counts.
+def silhouette_edges(camera: GroundCamera, pose: Array, size: Array) -> np.ndarray:
+    """Which of the EDGES (N, 12) border the silhouette: one of the two faces that meet there is seen, one is not."""
+    offset = camera.centre - np.concatenate([pose[:, :2], np.zeros((len(pose), 1))], axis=1)
+    c, s = np.cos(pose[:, 2]), np.sin(pose[:, 2])
+    along, across = c * offset[:, 0] + s * offset[:, 1], -s * offset[:, 0] + c * offset[:, 1]
+    length, width, height = size.T
+    seen = np.stack(
+        [
+            along < -length / 2,
+            along > length / 2,
+            across < -width / 2,
+            across > width / 2,
+            offset[:, 2] < 0,
+            offset[:, 2] > height,
+        ],
+        axis=1,
+    )
+    return np.asarray(seen[:, _MEET[:, 0]] != seen[:, _MEET[:, 1]])
+
+
+def tangents(hull: Array, at_border: np.ndarray, upright: bool = False, border_px: float = 0.0) -> Outlines:
+    """One outline of a hull (k, 2) px: its support in the fan's directions, moved out by `border_px`.
 
     Directions whose tangent touches the hull `at_border` (k,) see the frame's edge and not the vehicle; of an upright
     detection box only its four sides count.
@@ -76,7 +121,10 @@ def outline(hull: Array, at_border: np.ndarray, upright: bool = False) -> tuple[
     valid = ~at_border[outermost]
     if upright:
         valid &= AXES
-    return reach[outermost, np.arange(DIRECTIONS)], valid
+    support = reach[outermost, np.arange(DIRECTIONS)] + border_px
+    nowhere = np.zeros((DIRECTIONS, 2), dtype=int)
+    width = np.asarray(2 * support.mean())
+    return Outlines(FAN, support, nowhere, np.zeros(DIRECTIONS), valid, np.asarray(True), width)
 
 
 def fit(
@@ -92,24 +140,28 @@ def fit(
     """Fit N boxes to N outlines by Gauss-Newton from `pose` (N, 3) and `size` (N, 3).
 
     pose_sigma, size_sigma (N, 3) are the priors' deviations (inf: none); the prior on x, y is normally none, that on
-    theta the predicted heading's; sigma_px (N,) is the noise of each outline's tangents. Lou 2002, sec. 2 and 4.1.
+    theta the predicted heading's; sigma_px (N,) is the noise of each outline's rows. Lou 2002, sec. 2 and 4.1.
     """
     prior = np.concatenate([pose, size], axis=1)
     weight = 1 / np.concatenate([pose_sigma, size_sigma], axis=1) ** 2
     x = prior.copy()
-    valid = outlines.valid
+    valid, normal = outlines.valid, outlines.normal
     noise = np.asarray(sigma_px, dtype=float)[:, None]
     rows = np.arange(len(x))[:, None]
+    share = outlines.share[..., None]
     N = np.tile(np.eye(6), (len(x), 1, 1))
     residual = np.zeros_like(outlines.support)
     for _ in range(iterations):
         pixels, J_pixel = project(camera, corners(x[:, :3], x[:, 3:]))
-        reach = np.einsum("nck,dk->ncd", pixels, FAN)  # (N, 8, K)
-        active = np.argmax(np.nan_to_num(reach, nan=-np.inf), axis=1)  # (N, K)
+        pixels, J_pixel = np.nan_to_num(pixels, nan=-1e9), np.nan_to_num(J_pixel)
+        outermost = np.argmax(np.einsum("nck,ndk->ncd", pixels, normal), axis=1)
+        first, second = (np.where(outlines.tangent[:, None], outermost, outlines.corner[..., k]) for k in (0, 1))
+        at = (1 - share) * pixels[rows, first] + share * pixels[rows, second]
+        residual = outlines.support - np.einsum("ndk,ndk->nd", at, normal)
         J_corner = J_pixel @ _corner_jacobian(x[:, :3], x[:, 3:])  # (N, 8, 2, 6)
-        J = np.nan_to_num(np.einsum("ndkp,dk->ndp", J_corner[rows, active], FAN))
-        residual = np.nan_to_num(outlines.support - np.take_along_axis(reach, active[:, None], axis=1)[:, 0])
-        # A Cauchy weight: a mirror, a patch of shadow or a missing corner moves one tangent, not the box.
+        J_at = (1 - share)[..., None] * J_corner[rows, first] + share[..., None] * J_corner[rows, second]
+        J = np.einsum("ndkp,ndk->ndp", J_at, normal)
+        # A Cauchy weight: a mirror, a patch of shadow or a missing corner moves one row, not the box.
         robust = valid / (1 + (residual / (3 * noise)) ** 2) / noise**2
         N = np.einsum("nd,ndp,ndq->npq", robust, J, J) + weight[:, :, None] * np.eye(6)
         N += 1e-9 * np.trace(N, axis1=1, axis2=2)[:, None, None] * np.eye(6)

@@ -1,0 +1,90 @@
+"""What one frame says about followed things: a picture of labels, or detections from outside."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from visfuse_cli.maths.assignment import assign
+from visfuse_cli.maths.cameras import project
+from visfuse_cli.records import Array, GroundCamera, Image, Region
+from visfuse_cli.tracking.association import overlap, region_boxes
+from visfuse_cli.vision import contour, regions, wireframe
+from visfuse_cli.vision.contour import Look
+from visfuse_cli.vision.regions import Band
+from visfuse_cli.vision.wireframe import Outlines
+
+MARGIN = 0.08  # of a vehicle's width in the picture: what lies closer to it is its own
+LEAST_IOU = 0.2  # of a detection and the box expected there
+
+
+class Evidence(Protocol):
+    """One frame, ready to be asked."""
+
+    def look(self, pose: Array, size: Array, reach: Array) -> Look:
+        """Look for N boxes where they are expected, at most `reach` (N,) px off."""
+
+    def leftovers(self, pose: Array, size: Array) -> list[Region]:
+        """Regions that the N boxes do not explain."""
+
+
+class LabelEvidence:
+    """A labelled picture (255 foreground, 127 shadow)."""
+
+    def __init__(
+        self, labels: Image, camera: GroundCamera, cut: list[Band], gap_m: float, speck_m: float, smallest_m: float
+    ) -> None:
+        self._labels, self._camera, self._cut = labels, camera, cut
+        self._cleaning = gap_m, speck_m, smallest_m
+
+    def look(self, pose: Array, size: Array, reach: Array) -> Look:
+        owner = contour.owners(self._camera, pose, size)
+        return contour.search(self._labels, owner, self._camera, pose, size, reach)
+
+    def leftovers(self, pose: Array, size: Array) -> list[Region]:
+        explained = np.zeros_like(self._labels)
+        pixels, _ = project(self._camera, wireframe.corners(pose, size))
+        for corner in pixels:
+            if np.isfinite(corner).all():
+                hull = contour.hull_of(self._camera, corner)
+                margin = max(2, round(MARGIN * float(np.ptp(corner, axis=0).max())))
+                cv2.fillConvexPoly(explained, hull, 255)
+                cv2.polylines(explained, [hull], True, 255, 2 * margin + 1)
+        found = regions.find(self._labels, self._cut, *self._cleaning, explained)
+        lens = self._camera.ground.lens
+        return found if lens is None else [regions.undistorted(region, lens) for region in found]
+
+
+class BoxEvidence:
+    """Upright boxes from an external detector, as regions."""
+
+    def __init__(self, boxes: list[Region], camera: GroundCamera) -> None:
+        self._regions, self._camera = boxes, camera
+
+    def look(self, pose: Array, size: Array, reach: Array) -> Look:
+        seen: list[Outlines] = [_nothing() for _ in pose]
+        share = np.zeros(len(pose))
+        for region, thing in self._pairs(pose, size)[0]:
+            box = self._regions[region]
+            seen[thing] = wireframe.tangents(box.hull, box.at_border, upright=True)
+            share[thing] = 1.0
+        return Look(Outlines.stack(seen), share, share, share)
+
+    def leftovers(self, pose: Array, size: Array) -> list[Region]:
+        return [self._regions[k] for k in self._pairs(pose, size)[1]]
+
+    def _pairs(self, pose: Array, size: Array) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """Pairs (k, 2) of a detection and a box, and the detections left."""
+        pixels, _ = project(self._camera, wireframe.corners(pose, size))
+        pixels = np.nan_to_num(pixels, nan=-1e4)
+        expected = np.concatenate([pixels.min(axis=1), pixels.max(axis=1)], axis=1)
+        iou, _, _ = overlap(region_boxes(self._regions), expected)
+        pairs, free, _ = assign(np.where(iou >= LEAST_IOU, 1 - iou, np.inf))
+        return pairs, free
+
+
+def _nothing() -> Outlines:
+    return wireframe.tangents(np.zeros((1, 2)), np.ones(1, dtype=bool), upright=True)

@@ -1,0 +1,46 @@
+"""What the tracker holds of each thing it follows."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from visfuse_cli.records import Array
+from visfuse_cli.tracking.dynamics import Step
+from visfuse_cli.tracking.settings import SizePrior
+from visfuse_cli.vision.wireframe import Outlines
+
+
+@dataclass(slots=True)
+class Sample:
+    """One frame of a target: its outline, whether the whole of it was in view; `measured` when it was used."""
+
+    frame: int
+    t: float
+    outline: Outlines
+    whole: bool
+    measured: bool
+
+
+@dataclass(slots=True)
+class Track:
+    """A confirmed target: its samples, one filter step for each, and the belief of its size (m)."""
+
+    id: int
+    prior_class: SizePrior
+    size: Array
+    size_sigma: Array
+    samples: list[Sample]
+    steps: list[Step]
+    last_measured: float
+    refused: int = 0  # measurements that fell outside the gate
+    refused_since: float | None = None  # s: since when all of them did
+    ended_by: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Abandoned:
+    """A region given up before it became a track, for the rejection ledger."""
+
+    samples: tuple[Sample, ...]
+    position: tuple[float, float] | None
+    reason: str

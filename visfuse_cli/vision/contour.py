@@ -1,0 +1,135 @@
+"""The outline of a vehicle where it is expected: a search across each edge of its projected wireframe.
+
+The picture is one of labels (background, shadow, foreground). Along the normal of each silhouette edge the place is
+taken where most of what is inside moved and most of what is outside did not, so that holes in a region, a neighbour
+that touches it or a shadow beside it do not move the outline (Lou 2002, sec. 2: point-to-segment distance).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from visfuse_cli.maths.cameras import project
+from visfuse_cli.records import Array, GroundCamera, Image
+from visfuse_cli.vision.background import FOREGROUND
+from visfuse_cli.vision.lens import distort_points
+from visfuse_cli.vision.wireframe import DIRECTIONS, EDGES, Outlines, corners, silhouette_edges
+
+STEPS = 12  # places either side of the expected edge
+SURE = 4  # places either side of the found one that must agree
+UNKNOWN = 0  # evidence where another vehicle or the frame's border is in the way
+CLEAR_PX = 2.5  # between a border and the background outside it
+OPEN = 0.7  # of a profile that must be visible to expect a border in it
+LEAST = 0.1  # of a border or an area that must be visible to say anything about it
+_INSIDE = np.random.default_rng(0).dirichlet(np.full(8, 0.6), 64)  # points within a box, as weights of its corners
+
+
+def owners(camera: GroundCamera, pose: Array, size: Array) -> Image:
+    """Whose silhouette each pixel (H, W) belongs to: 1 + the row of the nearest box there, 0 of none, 255 at most."""
+    width, height = camera.image_size
+    mask = np.zeros((height, width), np.uint8)
+    distance = np.linalg.norm(pose[:, :2] - camera.centre[:2], axis=1)
+    pixels, _ = project(camera, corners(pose, size))
+    for k in np.argsort(-distance):
+        if np.isfinite(pixels[k]).all():
+            cv2.fillConvexPoly(mask, hull_of(camera, pixels[k]), int(min(k + 1, 255)))
+    return mask
+
+
+def hull_of(camera: GroundCamera, pixels: Array) -> np.ndarray:
+    """The hull (k, 2) of points (n, 2) px as the footage shows them, rounded."""
+    lens = camera.ground.lens
+    seen = pixels if lens is None else distort_points(pixels, lens)
+    return np.asarray(cv2.convexHull(np.round(np.clip(seen, -1e4, 1e4)).astype(np.int32)))
+
+
+@dataclass(frozen=True, slots=True)
+class Look:
+    """What was seen of N boxes: their outlines; of the border that nothing hides, the share (N,) that was found; of
+    the area that nothing hides, the share (N,) that moved. Shares are NaN where everything is hidden. `clear` (N,) is
+    the share of the found border outside which there is background, and not shadow or paint taken for it."""
+
+    outlines: Outlines
+    border: Array
+    moved: Array
+    clear: Array
+
+
+def search(labels: Image, owner: Image, camera: GroundCamera, pose: Array, size: Array, reach: Array) -> Look:
+    """Look for the outlines of N boxes with pose (N, 3) and size (N, 3), at most `reach` (N,) px off.
+
+    `labels` and `owner` (H, W) are the picture and whose silhouette is nearest in each pixel (see `owners`).
+    """
+    count = len(pose)
+    pixels, _ = project(camera, corners(pose, size))
+    pixels = np.nan_to_num(pixels, nan=-1e4)
+    ends = pixels[:, EDGES]  # (N, 12, 2, 2)
+    length = np.linalg.norm(ends[:, :, 1] - ends[:, :, 0], axis=2) * silhouette_edges(camera, pose, size)
+    total = np.cumsum(length, axis=1)
+    places = (np.arange(DIRECTIONS) + 0.5) / DIRECTIONS * total[:, -1:]
+    edge = np.minimum(np.sum(places[:, :, None] > total[:, None], axis=2), len(EDGES) - 1)  # (N, K)
+    rows = np.arange(count)[:, None]
+    share = (places - total[rows, edge]) / np.maximum(length[rows, edge], 1e-9) + 1
+    share = np.clip(share, 0, 1)
+    a, b = ends[rows, edge, 0], ends[rows, edge, 1]
+    at = a + share[..., None] * (b - a)
+    normal = np.stack([b[..., 1] - a[..., 1], a[..., 0] - b[..., 0]], axis=-1)
+    normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-9)
+    inward = np.sum(normal * (at - pixels.mean(axis=1)[:, None]), axis=-1) < 0
+    normal[inward] *= -1
+
+    offset = reach[:, None] * np.linspace(-1, 1, 2 * STEPS + 1)  # (N, S)
+    along = at[:, :, None] + normal[:, :, None] * offset[:, None, :, None]  # (N, K, S, 2)
+    label, whose, inside = _look(labels, owner, camera, along)
+    known = inside & ((whose == 0) | (whose == np.arange(1, count + 1)[:, None, None]))
+    found = np.full((2, *places.shape), np.nan)
+    for k, moved in enumerate((label == FOREGROUND, label > 0)):  # shadow is outside, or it is grey paint
+        found[k] = _border(np.where(known, 2 * moved - 1, UNKNOWN), offset)
+    nearest = np.where(np.abs(found[1]) < np.abs(np.nan_to_num(found[0], nan=np.inf)), found[1], found[0])
+    valid = np.isfinite(nearest)
+    support = np.sum(normal * at, axis=-1) + np.nan_to_num(nearest)
+    outlines = Outlines(normal, support, EDGES[edge], share, valid, np.zeros(count, dtype=bool), total[:, -1] / np.pi)
+
+    open_ = known.mean(axis=2) > OPEN
+    label, whose, inside = _look(labels, owner, camera, np.einsum("pc,nck->npk", _INSIDE, pixels))
+    own = inside & (whose == np.arange(1, count + 1)[:, None])
+    clear = valid & (np.abs(found[1] - nearest) < CLEAR_PX)
+    return Look(outlines, _share(valid & open_, open_), _share(own & (label > 0), own), _share(clear, valid))
+
+
+def _share(part: np.ndarray, whole: np.ndarray) -> Array:
+    """Share (N,) of `part` in `whole` (N, K); NaN where `whole` is nearly nothing."""
+    enough = whole.mean(axis=1) > LEAST
+    return np.where(enough, part.sum(axis=1) / np.maximum(whole.sum(axis=1), 1), np.nan)
+
+
+def _look(
+    labels: Image, owner: Image, camera: GroundCamera, points: Array
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Labels, owners and whether they lie in the picture, at points (..., 2) px."""
+    if camera.ground.lens is not None:
+        points = distort_points(points.reshape(-1, 2), camera.ground.lens).reshape(points.shape)
+    height, width = labels.shape
+    whole = np.round(np.clip(points, -2, 1e5)).astype(int)
+    u, v = np.clip(whole[..., 0], 0, width - 1), np.clip(whole[..., 1], 0, height - 1)
+    inside = (whole[..., 0] > 0) & (whole[..., 0] < width - 1) & (whole[..., 1] > 0) & (whole[..., 1] < height - 1)
+    return labels[v, u], owner[v, u], inside
+
+
+def _border(evidence: np.ndarray, offset: Array) -> Array:
+    """Where (N, K) px, along profiles (N, K, S) of +1 inside, -1 outside, 0 unknown, the border lies; NaN: nowhere."""
+    total = np.cumsum(evidence, axis=2)
+    before = total[:, :, SURE - 1 :].copy()
+    before[:, :, 1:] -= total[:, :, :-SURE]  # sums of SURE places that end here
+    first, last = SURE - 1, total.shape[2] - SURE - 1  # a border lies after place c, first <= c <= last
+    inner = before[:, :, : last - first + 1]
+    outer = before[:, :, SURE : SURE + last - first + 1]
+    sure = (inner >= SURE // 2) & (outer <= -SURE // 2)
+    split = np.where(sure, 2 * total[:, :, first : last + 1] - total[:, :, -1:], -np.inf)
+    best = np.argmax(split, axis=2)
+    found = np.take_along_axis(split, best[..., None], axis=2)[..., 0] > -np.inf
+    middle = (offset[:, first : last + 1] + offset[:, first + 1 : last + 2]) / 2
+    return np.where(found, np.take_along_axis(middle, best, axis=1), np.nan)
