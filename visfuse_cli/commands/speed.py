@@ -35,10 +35,10 @@ from visfuse_cli.tracking.settings import TrackerSettings
 from visfuse_cli.tracking.targets import Abandoned, Track
 from visfuse_cli.tracking.verdict import SpeedSettings, judge
 from visfuse_cli.vision import regions as region_tools
-from visfuse_cli.vision.background import Background, median_picture
+from visfuse_cli.vision.background import Background, empty_picture
 from visfuse_cli.vision.lens import distort_points
 
-WARMUP_PICTURES = 31  # an odd number, so that the median is a picture's own value
+WARMUP_PICTURES = 31
 SEEN_FRAMES = 8  # a region seen for fewer frames than this is noise and not worth a line in the ledger
 
 Polygon = tuple[tuple[float, float], ...]
@@ -57,7 +57,7 @@ class BackgroundSettings(Section):
     threshold: float = Field(16.0, gt=0, le=1000, description="squared distance (variances) of a foreground pixel")
     memory_s: float = Field(60.0, gt=0, le=36000, description="s: how long the background remembers")
     shadow_ratio: float = Field(0.45, gt=0, lt=1, description="darkest a shadow may be, as a share of the lit ground")
-    warmup_s: float = Field(20.0, ge=0, le=600, description="s: the empty scene is the median over this much footage")
+    warmup_s: float = Field(20.0, ge=0, le=600, description="s: the empty scene is found in this much footage")
 
 
 class RegionSettings(Section):
@@ -227,7 +227,7 @@ class _MovingRegions:
         self._bands = region_tools.bands(clip.camera)
         self._background = Background(settings.model, settings.threshold, settings.shadow_ratio)
         with run_.stage("warm up"):
-            self._background.start(median_picture(_sampled(clip.source, settings.warmup_s)))
+            self._background.start(empty_picture(_sampled(clip.source, settings.warmup_s)))
         self._t = 0.0
 
     def evidence(self, frame: Frame) -> Evidence:
@@ -305,8 +305,8 @@ def _settle(
             results.speeds.append(verdict.speed)
             run_.count("vehicles")
     for candidate in abandoned:
-        if candidate.position is not None and len(candidate.samples) >= SEEN_FRAMES:
-            results.rejected.append(abandoned_row(candidate, clip.name, _utc(begun, candidate.samples[0].t)))
+        if candidate.position is not None and candidate.n_frames >= SEEN_FRAMES:
+            results.rejected.append(abandoned_row(candidate, clip.name, _utc(begun, candidate.t_start)))
         run_.count("regions that never became a track")
 
 

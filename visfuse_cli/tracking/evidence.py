@@ -13,10 +13,12 @@ from visfuse_cli.maths.cameras import project
 from visfuse_cli.records import Array, GroundCamera, Image, Region
 from visfuse_cli.tracking.association import overlap, region_boxes
 from visfuse_cli.vision import contour, regions, wireframe
+from visfuse_cli.vision.background import FOREGROUND, SHADOW
 from visfuse_cli.vision.contour import Look
 from visfuse_cli.vision.regions import Band
 from visfuse_cli.vision.wireframe import Outlines
 
+Boxes = tuple[Array, Array]  # pose (N, 3) and size (N, 3)
 MARGIN = 0.08  # of a vehicle's width in the picture: what lies closer to it is its own
 LEAST_IOU = 0.2  # of a detection and the box expected there
 
@@ -25,10 +27,16 @@ class Evidence(Protocol):
     """One frame, ready to be asked."""
 
     def look(self, pose: Array, size: Array, reach: Array) -> Look:
-        """Look for N boxes where they are expected, at most `reach` (N,) px off."""
+        """Look for N boxes where they are expected, at most `reach` (N,) px off; they hide one another."""
+
+    def probe(self, pose: Array, size: Array, reach: Array, taken: Boxes) -> Look:
+        """Look for each of N boxes as if it alone stood among those `taken`."""
 
     def leftovers(self, pose: Array, size: Array) -> list[Region]:
         """Regions that the N boxes do not explain."""
+
+    def pack(self) -> None:
+        """Take little memory from now on: the frame is past."""
 
 
 class LabelEvidence:
@@ -37,15 +45,36 @@ class LabelEvidence:
     def __init__(
         self, labels: Image, camera: GroundCamera, cut: list[Band], gap_m: float, speck_m: float, smallest_m: float
     ) -> None:
-        self._labels, self._camera, self._cut = labels, camera, cut
+        self._picture: Image | None = labels
+        self._bits: tuple[Image, Image] | None = None
+        self._camera, self._cut = camera, cut
         self._cleaning = gap_m, speck_m, smallest_m
+
+    @property
+    def _labels(self) -> Image:
+        if self._picture is None and self._bits is not None:
+            width, _ = self._camera.image_size
+            moved, paint = (np.unpackbits(bits, axis=1, count=width) for bits in self._bits)
+            self._picture = moved * np.uint8(SHADOW) + paint * np.uint8(FOREGROUND - SHADOW)
+        assert self._picture is not None
+        return self._picture
+
+    def pack(self) -> None:
+        if self._bits is None:
+            self._bits = np.packbits(self._labels > 0, axis=1), np.packbits(self._labels == FOREGROUND, axis=1)
+        self._picture = None
 
     def look(self, pose: Array, size: Array, reach: Array) -> Look:
         owner = contour.owners(self._camera, pose, size)
-        return contour.search(self._labels, owner, self._camera, pose, size, reach)
+        return contour.search(self._labels, owner, np.arange(1, len(pose) + 1), self._camera, pose, size, reach)
+
+    def probe(self, pose: Array, size: Array, reach: Array, taken: Boxes) -> Look:
+        owner = contour.owners(self._camera, *taken)
+        return contour.search(self._labels, owner, np.zeros(len(pose)), self._camera, pose, size, reach)
 
     def leftovers(self, pose: Array, size: Array) -> list[Region]:
-        explained = np.zeros_like(self._labels)
+        labels = self._labels
+        explained = np.zeros_like(labels)
         pixels, _ = project(self._camera, wireframe.corners(pose, size))
         for corner in pixels:
             if np.isfinite(corner).all():
@@ -53,7 +82,7 @@ class LabelEvidence:
                 margin = max(2, round(MARGIN * float(np.ptp(corner, axis=0).max())))
                 cv2.fillConvexPoly(explained, hull, 255)
                 cv2.polylines(explained, [hull], True, 255, 2 * margin + 1)
-        found = regions.find(self._labels, self._cut, *self._cleaning, explained)
+        found = regions.find(labels, self._cut, *self._cleaning, explained)
         lens = self._camera.ground.lens
         return found if lens is None else [regions.undistorted(region, lens) for region in found]
 
@@ -66,24 +95,46 @@ class BoxEvidence:
 
     def look(self, pose: Array, size: Array, reach: Array) -> Look:
         seen: list[Outlines] = [_nothing() for _ in pose]
-        share = np.zeros(len(pose))
+        share = np.full(len(pose), np.nan)
         for region, thing in self._pairs(pose, size)[0]:
-            box = self._regions[region]
-            seen[thing] = wireframe.tangents(box.hull, box.at_border, upright=True)
+            seen[thing] = self._sides(region)
             share[thing] = 1.0
-        return Look(Outlines.stack(seen), share, share, share)
+        return Look(Outlines.stack(seen), share, share, share, share, share)
+
+    def probe(self, pose: Array, size: Array, reach: Array, taken: Boxes) -> Look:
+        free = set(self._pairs(*taken)[1].tolist())
+        iou = self._overlaps(pose, size)
+        iou[[k for k in range(len(iou)) if k not in free]] = 0
+        seen, share = [_nothing() for _ in pose], np.full(len(pose), np.nan)
+        if len(iou):
+            for thing, best in enumerate(np.argmax(iou, axis=0)):
+                if iou[best, thing] >= LEAST_IOU:
+                    seen[thing] = self._sides(best)
+                    share[thing] = 1.0
+        return Look(Outlines.stack(seen), share, share, share, share, share)
+
+    def pack(self) -> None:
+        """A few boxes are little."""
 
     def leftovers(self, pose: Array, size: Array) -> list[Region]:
         return [self._regions[k] for k in self._pairs(pose, size)[1]]
 
     def _pairs(self, pose: Array, size: Array) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
         """Pairs (k, 2) of a detection and a box, and the detections left."""
+        iou = self._overlaps(pose, size)
+        pairs, free, _ = assign(np.where(iou >= LEAST_IOU, 1 - iou, np.inf))
+        return pairs, free
+
+    def _overlaps(self, pose: Array, size: Array) -> Array:
+        """Intersection over union (R, N) of each detection with each expected box."""
         pixels, _ = project(self._camera, wireframe.corners(pose, size))
         pixels = np.nan_to_num(pixels, nan=-1e4)
         expected = np.concatenate([pixels.min(axis=1), pixels.max(axis=1)], axis=1)
-        iou, _, _ = overlap(region_boxes(self._regions), expected)
-        pairs, free, _ = assign(np.where(iou >= LEAST_IOU, 1 - iou, np.inf))
-        return pairs, free
+        return overlap(region_boxes(self._regions), expected)[0]
+
+    def _sides(self, number: int) -> Outlines:
+        box = self._regions[number]
+        return wireframe.tangents(box.hull, box.at_border, upright=True)
 
 
 def _nothing() -> Outlines:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from bisect import bisect_left
+from collections import deque
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -14,7 +17,8 @@ from visfuse_cli.tracking import measure
 from visfuse_cli.tracking.association import footprint_contains
 from visfuse_cli.tracking.births import Nursery
 from visfuse_cli.tracking.dynamics import Dynamics, Prediction, Step
-from visfuse_cli.tracking.evidence import Evidence
+from visfuse_cli.tracking.evidence import Boxes, Evidence
+from visfuse_cli.tracking.lookback import Recent
 from visfuse_cli.tracking.settings import TrackerSettings
 from visfuse_cli.tracking.targets import Abandoned, Sample, Track
 from visfuse_cli.vision import wireframe
@@ -22,6 +26,7 @@ from visfuse_cli.vision import wireframe
 VAGUE_M = 1.5  # m: a pose less certain than this is no measurement
 YOUNG, LEAP = 12, 4.0  # frames after which one measurement may not change the velocity by more (m/s)
 SEEN_SHARE = 0.4  # of the unhidden part of a box that must have moved: less, and nothing is there
+LOOK_BACK_FRAMES = 120  # at most
 REACH_PX = (4.0, 24.0)  # how far from its prediction an outline is looked for
 
 
@@ -41,6 +46,7 @@ class GroundTracker:
         self._gate = gate_size(len(self.dynamics.H), settings.pose.gate)
         self._t = 0.0
         self._expected: list[Prediction] = []  # of each track, at the predicted time
+        self._recent: Recent = deque()
 
     def predict(self, t: float) -> None:
         """Advance every track to time t (s)."""
@@ -59,10 +65,9 @@ class GroundTracker:
         """Measure every track, and let the rest become tracks; returns the tracks and candidates that ended."""
         if self.tracks:
             self._measure(frame, evidence)
+        self._remember(frame, evidence)
         self._nursery.feed(frame, self._t, evidence.leftovers(*self._boxes()))
-        born = self._nursery.born(self.next_id, evidence, *self._boxes())
-        self.next_id += len(born)
-        self.tracks += born
+        self.next_id = self._nursery.born(self.next_id, self.tracks, self._recent, self._boxes_at)
         return self._end(), self._nursery.give_up(self._t)
 
     def finish(self) -> tuple[list[Track], list[Abandoned]]:
@@ -79,6 +84,25 @@ class GroundTracker:
         """Pose (N, 3) and size (N, 3) of the tracks, as last known."""
         pose = [self._pose_of(track.steps[-1].posterior.mean) for track in self.tracks]
         return np.array(pose).reshape(-1, 3), np.array([track.size for track in self.tracks]).reshape(-1, 3)
+
+    def _boxes_at(self, frame: int) -> Boxes:
+        """Pose (N, 3) and size (N, 3) of the tracks that were followed in a frame, there."""
+        pose, size = [], []
+        for track in self.tracks:
+            k = bisect_left(track.samples, frame, key=lambda sample: sample.frame)
+            if k < len(track.samples) and track.samples[k].frame == frame:
+                pose.append(self._pose_of(track.steps[k].posterior.mean))
+                size.append(track.size)
+        return np.array(pose).reshape(-1, 3), np.array(size).reshape(-1, 3)
+
+    def _remember(self, frame: int, evidence: Evidence) -> None:
+        if self._recent:
+            self._recent[-1][2].pack()
+        self._recent.append((frame, self._t, evidence))
+        life, recent = self.settings.life, self._recent
+        least = life.confirm_frames + 2
+        while len(recent) > LOOK_BACK_FRAMES or (len(recent) > least and self._t - recent[0][1] > life.look_back_s):
+            recent.popleft()
 
     def _pose_of(self, x: Array) -> Array:
         return np.array([x[0], x[1], self.dynamics.heading(x)])

@@ -114,10 +114,10 @@ def abandoned_row(abandoned: Abandoned, clip: str, time_utc: str) -> dict[str, A
     empty = dict.fromkeys(COLUMNS, "")
     return empty | {
         "clip": clip,
-        "t_start": f"{abandoned.samples[0].t:.3f}",
-        "t_end": f"{abandoned.samples[-1].t:.3f}",
+        "t_start": f"{abandoned.t_start:.3f}",
+        "t_end": f"{abandoned.t_end:.3f}",
         "time_utc": time_utc,
-        "n_frames": len(abandoned.samples),
+        "n_frames": abandoned.n_frames,
         "reason": abandoned.reason,
     }
 

@@ -41,6 +41,8 @@ class Track:
 class Abandoned:
     """A region given up before it became a track, for the rejection ledger."""
 
-    samples: tuple[Sample, ...]
+    t_start: float
+    t_end: float
+    n_frames: int
     position: tuple[float, float] | None
     reason: str

@@ -11,11 +11,7 @@ import numpy as np
 from visfuse_cli.records import Array, Image
 
 FOREGROUND, SHADOW = 255, 127
-BINS = 64  # of the ratio of a pixel to the background, from 0 to 1
-SHADOW_REACH = 4  # bins either side of the shadows' own ratio: sensor noise and texture
-SUN_LIMIT = 0.8  # shadows of the sun are darker than this
-DARKER_SHARE, LIGHTER_SHARE = 0.2, 0.7  # of all shadow pixels within reach, to call darker or lighter ones paint
-SHADOW_MEMORY = 0.995  # a frame: clouds come and go
+AGREE = 1 / 3  # of the pictures of a scene that show a pixel without traffic, at least
 LEARN_EVERY = 4  # frames: learning costs as much as looking
 
 
@@ -38,7 +34,6 @@ class Background:
         self._waiting = 0  # frames since the last one that was learnt
         self._share = 0.0
         self._picture: Image | None = None
-        self._shadows = _ShadowDepth()
 
     def start(self, picture: Image) -> None:
         """Begin from a picture (H, W, 3) of the empty scene."""
@@ -47,10 +42,7 @@ class Background:
 
     def detect(self, image: Image) -> Image:
         """Label each pixel of `image` (H, W, 3): 255 foreground, 127 shadow, 0 background, without learning it."""
-        labels = np.asarray(self._model.apply(image, learningRate=0.0), dtype=np.uint8)
-        if self._picture is not None:
-            pass  # self._shadows.relabel(labels, image, self._picture)
-        return labels
+        return np.asarray(self._model.apply(image, learningRate=0.0), dtype=np.uint8)
 
     def learn(self, image: Image, rate: float, followed: Iterable[Array]) -> None:
         """Adapt to `image` by `rate` (share a frame) except inside the followed outlines (k, 2) px."""
@@ -70,42 +62,19 @@ class Background:
         self._picture = cv2.addWeighted(image, max(rate, 1 / 64), self._picture, 1 - max(rate, 1 / 64), 0)
 
 
-class _ShadowDepth:
-    """How dark this recording's cast shadows are: one sun casts them all, they share one ratio to the lit ground.
+def empty_picture(images: Iterable[Image]) -> Image:
+    """The scene without its traffic: per pixel and channel, the middle of where most of a few pictures agree.
 
-    Where that ratio stands out, what is darker is no shadow but a tyre, a bumper or dark paint, and where nearly all
-    shadow has it, what is lighter is grey paint.
+    The narrowest interval that holds a third of the values is the road even where vehicles cover it most of the time.
     """
-
-    def __init__(self) -> None:
-        self._histogram = np.zeros(BINS)
-
-    def relabel(self, labels: Image, image: Image, picture: Image) -> None:
-        """Turn `labels` from shadow to foreground where the darkening is not the shadows' own."""
-        at = np.nonzero(labels == SHADOW)
-        if not len(at[0]):
-            return
-        lit = np.maximum(picture[at].sum(axis=1, dtype=np.int32), 1)
-        level = np.minimum(image[at].sum(axis=1, dtype=np.int32) * BINS // lit, BINS - 1)
-        self._histogram = SHADOW_MEMORY * self._histogram + np.bincount(level, minlength=BINS)
-        near = np.convolve(self._histogram, np.ones(2 * SHADOW_REACH + 1), mode="same") / self._histogram.sum()
-        modes = (near[1:-1] >= near[:-2]) & (near[1:-1] >= near[2:]) & (near[1:-1] > DARKER_SHARE)
-        modes[int(SUN_LIMIT * BINS) :] = False
-        if not modes.any():
-            return  # the even light of a cloudy sky: no ratio stands out
-        peak = int(np.flatnonzero(modes)[-1]) + 1  # the lightest: tyres and bumpers are darker than shadows
-        share = near[peak]
-        paint = level < peak - SHADOW_REACH
-        if share > LIGHTER_SHARE:
-            paint |= level > peak + SHADOW_REACH
-        labels[at[0][paint], at[1][paint]] = FOREGROUND
-
-
-def median_picture(images: Iterable[Image]) -> Image:
-    """The per-pixel median of a few pictures of one scene: what stood still through most of them."""
     stack = np.stack(list(images))
-    rows = max(1, 4_000_000 // (stack.shape[0] * stack.shape[2] * 3))
+    count = len(stack)
+    held = max(1, round(AGREE * count))
+    rows = max(1, 4_000_000 // (count * stack.shape[2] * 3))
     picture = np.empty(stack.shape[1:], np.uint8)
     for top in range(0, stack.shape[1], rows):
-        picture[top : top + rows] = np.median(stack[:, top : top + rows], axis=0)
+        value = np.sort(stack[:, top : top + rows], axis=0)
+        narrowest = np.argmin(value[held - 1 :] - value[: count - held + 1], axis=0)
+        middle = (narrowest + (held - 1) // 2)[None]
+        picture[top : top + rows] = np.take_along_axis(value, middle, axis=0)[0]
     return picture

@@ -48,20 +48,31 @@ def hull_of(camera: GroundCamera, pixels: Array) -> np.ndarray:
 
 @dataclass(frozen=True, slots=True)
 class Look:
-    """What was seen of N boxes: their outlines; of the border that nothing hides, the share (N,) that was found; of
-    the area that nothing hides, the share (N,) that moved. Shares are NaN where everything is hidden. `clear` (N,) is
-    the share of the found border outside which there is background, and not shadow or paint taken for it."""
+    """What was seen of N boxes, as shares (N,) of what nothing hides; NaN where nearly everything is hidden.
+
+    border: of the border, what was found; clear: of the found border, what has background outside and not shadow or
+    paint; moved: of the area, what differs from the background; paint: of the area, what differs and is no shadow;
+    open: of the area, what is in view.
+    """
 
     outlines: Outlines
     border: Array
-    moved: Array
     clear: Array
+    moved: Array
+    paint: Array
+    open: Array
+
+    def __getitem__(self, which: object) -> Look:
+        return Look(*(getattr(self, name)[which] for name in self.__dataclass_fields__))
 
 
-def search(labels: Image, owner: Image, camera: GroundCamera, pose: Array, size: Array, reach: Array) -> Look:
+def search(
+    labels: Image, owner: Image, code: Array, camera: GroundCamera, pose: Array, size: Array, reach: Array
+) -> Look:
     """Look for the outlines of N boxes with pose (N, 3) and size (N, 3), at most `reach` (N,) px off.
 
-    `labels` and `owner` (H, W) are the picture and whose silhouette is nearest in each pixel (see `owners`).
+    `labels` and `owner` (H, W) are the picture and whose silhouette is nearest in each pixel (see `owners`); `code`
+    (N,) is what the boxes are called there, 0 when they are not.
     """
     count = len(pose)
     pixels, _ = project(camera, corners(pose, size))
@@ -84,7 +95,7 @@ def search(labels: Image, owner: Image, camera: GroundCamera, pose: Array, size:
     offset = reach[:, None] * np.linspace(-1, 1, 2 * STEPS + 1)  # (N, S)
     along = at[:, :, None] + normal[:, :, None] * offset[:, None, :, None]  # (N, K, S, 2)
     label, whose, inside = _look(labels, owner, camera, along)
-    known = inside & ((whose == 0) | (whose == np.arange(1, count + 1)[:, None, None]))
+    known = inside & ((whose == 0) | (whose == code[:, None, None]))
     found = np.full((2, *places.shape), np.nan)
     for k, moved in enumerate((label == FOREGROUND, label > 0)):  # shadow is outside, or it is grey paint
         found[k] = _border(np.where(known, 2 * moved - 1, UNKNOWN), offset)
@@ -93,11 +104,18 @@ def search(labels: Image, owner: Image, camera: GroundCamera, pose: Array, size:
     support = np.sum(normal * at, axis=-1) + np.nan_to_num(nearest)
     outlines = Outlines(normal, support, EDGES[edge], share, valid, np.zeros(count, dtype=bool), total[:, -1] / np.pi)
 
-    open_ = known.mean(axis=2) > OPEN
+    in_view = known.mean(axis=2) > OPEN
     label, whose, inside = _look(labels, owner, camera, np.einsum("pc,nck->npk", _INSIDE, pixels))
-    own = inside & (whose == np.arange(1, count + 1)[:, None])
+    own = inside & (whose == code[:, None])
     clear = valid & (np.abs(found[1] - nearest) < CLEAR_PX)
-    return Look(outlines, _share(valid & open_, open_), _share(own & (label > 0), own), _share(clear, valid))
+    return Look(
+        outlines,
+        border=_share(valid & in_view, in_view),
+        clear=_share(clear, valid),
+        moved=_share(own & (label > 0), own),
+        paint=_share(own & (label == FOREGROUND), own),
+        open=own.mean(axis=1),
+    )
 
 
 def _share(part: np.ndarray, whole: np.ndarray) -> Array:
