@@ -94,12 +94,18 @@ class GroundMap:
 
 @dataclass(frozen=True, slots=True)
 class Region:
-    """One connected moving region: box (4,) px, hull (k, 2) px of its outline, which hull points lie on the border."""
+    """One connected moving region: box (4,) px, hull (k, 2) px of its outline, which hull points lie on the border.
+
+    `around` (4,) px is the box of all that moves in one piece with it: shadow, and paint that was taken for road or
+    shadow; `around_area` px^2 is how much that is.
+    """
 
     box: Array
     hull: Array
     at_border: NDArray[np.bool_]  # (k,): the frame's edge was seen there and not the thing's own
     area: float
+    around: Array
+    around_area: float
     score: float = 1.0
     upright: bool = False  # a detector's box: only its four sides are the thing's own
 

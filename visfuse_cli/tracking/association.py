@@ -7,12 +7,11 @@ from numpy.typing import NDArray
 
 from visfuse_cli.maths.assignment import assign
 from visfuse_cli.records import Array, Region
-from visfuse_cli.vision import regions as region_tools
 
 INSIDE = 0.6  # share of a region inside an expected box that makes it a part of that thing
 COVERED = 0.5  # share of an expected box under one region that makes the thing a part of that region
 LEAST_IOU = 0.2
-FRAGMENT_GAP = 0.25  # of a region's size: parts of one vehicle lie closer together, two vehicles mostly apart
+YOUNGER = 0.1  # of overlap: what the first of the expected things is given before the last
 
 
 def overlap(first: Array, second: Array) -> tuple[Array, Array, Array]:
@@ -31,32 +30,19 @@ def region_boxes(regions: list[Region]) -> Array:
     return np.concatenate([boxes[:, :2], boxes[:, :2] + boxes[:, 2:]], axis=1)
 
 
-def claim(regions: list[Region], expected: Array) -> tuple[list[Region | None], NDArray[np.bool_]]:
-    """Give regions to the things expected in boxes [x0, y0, x1, y1] (T, 4), one to one; and which were given out.
+def claim(regions: list[Region], expected: Array) -> NDArray[np.intp]:
+    """Which region (T,) belongs to each of the things expected in boxes [x0, y0, x1, y1] (T, 4), one to one; -1: none.
 
-    Fragments inside one box are joined when they lie close together; a region over several boxes is given to none.
+    Where several would do, the thing that comes first has the better claim.
     """
-    used = np.zeros(len(regions), dtype=bool)
-    given: list[Region | None] = [None] * len(expected)
-    if not len(regions) or not len(expected):
-        return given, used
-    boxes = region_boxes(regions)
-    iou, inside, covered = overlap(boxes, expected)
-    shared = np.sum(covered >= COVERED, axis=1) > 1
-    belongs = ((inside >= INSIDE) | (covered >= COVERED) | (iou >= LEAST_IOU)) & ~shared[:, None]
-    pairs, loose, _ = assign(np.where(belongs, 1 - iou, np.inf))
-    parts = {int(thing): [int(r)] for r, thing in pairs}
-    for r in (int(each) for each in loose):
-        thing = int(np.argmax(inside[r]))
-        if inside[r, thing] >= INSIDE and not shared[r] and thing in parts:
-            main = boxes[parts[thing][0]]
-            gap = np.max(np.maximum(main[:2] - boxes[r, 2:], boxes[r, :2] - main[2:]))
-            if gap <= FRAGMENT_GAP * np.max(main[2:] - main[:2]):
-                parts[thing].append(r)
-    for thing, members in parts.items():
-        given[thing] = region_tools.joined([regions[r] for r in members])
-        used[members] = True
-    return given, used
+    given = np.full(len(expected), -1)
+    if len(regions) and len(expected):
+        iou, inside, covered = overlap(region_boxes(regions), expected)
+        belongs = (inside >= INSIDE) | (covered >= COVERED) | (iou >= LEAST_IOU)
+        younger = YOUNGER * np.arange(len(expected)) / len(expected)
+        pairs, _, _ = assign(np.where(belongs, 1 - iou + younger, np.inf))
+        given[pairs[:, 1]] = pairs[:, 0]
+    return given
 
 
 def footprint_contains(outer_pose: Array, outer_size: Array, point: Array) -> bool:

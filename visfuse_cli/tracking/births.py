@@ -35,6 +35,7 @@ class Candidate:
     samples: list[tuple[int, float]]  # frame, t
     anchors: list[tuple[float, float, float, float]]  # t, X, Y, m per px, where the foot of the region is seen
     box: Array
+    region: Region
     drift: Array = field(default_factory=lambda: np.zeros(2))  # px/s
     missed_since: float | None = None
     asked_again: float = 0.0  # s: not before
@@ -50,15 +51,15 @@ class Nursery:
     def feed(self, frame: int, t: float, regions: list[Region]) -> None:
         """Give the frame's unexplained regions to candidates, new ones where none fits."""
         drifted = [c.box + np.tile(c.drift * (t - c.samples[-1][1]), 2) for c in self._candidates]
-        given, used = claim(regions, np.array(drifted).reshape(-1, 4))
-        for candidate, region in zip(self._candidates, given, strict=True):
-            if region is not None:
-                self._extend(candidate, frame, t, region)
+        given = claim(regions, np.array(drifted).reshape(-1, 4))
+        for candidate, number in zip(self._candidates, given, strict=True):
+            if number >= 0:
+                self._extend(candidate, frame, t, regions[number])
             elif candidate.missed_since is None:
                 candidate.missed_since = t
-        for region, taken in zip(regions, used, strict=True):
-            if not taken:
-                fresh = Candidate([], [], region_boxes([region])[0])
+        for number, region in enumerate(regions):
+            if number not in given:
+                fresh = Candidate([], [], region_boxes([region])[0], region)
                 self._extend(fresh, frame, t, region)
                 self._candidates.append(fresh)
 
@@ -105,7 +106,7 @@ class Nursery:
             dt = t - candidate.samples[-1][1]
             moved = (box - candidate.box).reshape(2, 2).mean(axis=0) / max(dt, 1e-6)
             candidate.drift = 0.5 * candidate.drift + 0.5 * moved
-        candidate.box, candidate.missed_since = box, None
+        candidate.box, candidate.region, candidate.missed_since = box, region, None
         candidate.samples.append((frame, t))
         border = 0.0 if region.upright else self._settings.pose.border_px
         outline = wireframe.tangents(region.hull, region.at_border, region.upright, border)
@@ -126,7 +127,7 @@ class Nursery:
         heading = float(np.arctan2(velocity[1], velocity[0]))
         frame, _, evidence = recent[-1]
         settings, camera = self._settings, self._camera
-        guess = best_guess(camera, settings, evidence, candidate.box, heading, taken_at(frame))
+        guess = best_guess(camera, settings, evidence, candidate.region, heading, taken_at(frame))
         if guess is None:
             return None
         samples, pose = trace(camera, settings, self._dynamics, recent, taken_at, guess, velocity)

@@ -46,6 +46,7 @@ class Path:
     pixel: Array
     nis: Array
     refused: int
+    likeness: float  # mean share of the outline that was found
     misfit_px: float
     ended_by: str
 
@@ -91,6 +92,7 @@ def conclude(track: Track, camera: GroundCamera, settings: TrackerSettings, dyna
         pixel=pixel,
         nis=nis,
         refused=track.refused,
+        likeness=float(np.nanmean([s.border for s in samples if s.measured])),
         misfit_px=misfit,
         ended_by=track.ended_by,
     )

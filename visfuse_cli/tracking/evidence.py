@@ -70,7 +70,7 @@ class LabelEvidence:
 
     def probe(self, pose: Array, size: Array, reach: Array, taken: Boxes) -> Look:
         owner = contour.owners(self._camera, *taken)
-        return contour.search(self._labels, owner, np.zeros(len(pose)), self._camera, pose, size, reach)
+        return contour.search(self._labels, owner, np.zeros(len(pose), int), self._camera, pose, size, reach)
 
     def leftovers(self, pose: Array, size: Array) -> list[Region]:
         labels = self._labels

@@ -25,7 +25,8 @@ from visfuse_cli.vision import wireframe
 
 VAGUE_M = 1.5  # m: a pose less certain than this is no measurement
 YOUNG, LEAP = 12, 4.0  # frames after which one measurement may not change the velocity by more (m/s)
-SEEN_SHARE = 0.4  # of the unhidden part of a box that must have moved: less, and nothing is there
+SEEN_SHARE = 0.4  # of the unhidden area of a box that must have moved and of its border that must be found
+LIKENESS_S, UNLIKE = 0.4, 0.5  # s over which the share of the border that is found is averaged, and too little of it
 LOOK_BACK_FRAMES = 120  # at most
 REACH_PX = (4.0, 24.0)  # how far from its prediction an outline is looked for
 
@@ -114,10 +115,14 @@ class GroundTracker:
         look = evidence.look(pose, size, self._reach(pose))
         inside = self._inside(pose, size)
         fit = measure.fit_poses(self.camera, look.outlines, pose, size, sigma, self.settings.pose)
-        there = fit.ok & measure.looks_right(fit, look.outlines) & (look.moved > SEEN_SHARE)
+        border = look.border * fit.agreed
+        there = fit.ok & measure.looks_right(fit, look.outlines) & (look.moved > SEEN_SHARE) & ~(border < SEEN_SHARE)
         for k, track in enumerate(self.tracks):
             step = dynamics_tools.coast(self._expected[k], track.steps[-1].memory)
-            sample = Sample(frame, self._t, look.outlines[k], bool(inside[k]), False)
+            if np.isfinite(border[k]):
+                elapsed = self._t - track.samples[-1].t
+                track.likeness += (border[k] - track.likeness) * min(1.0, elapsed / LIKENESS_S)
+            sample = Sample(frame, self._t, look.outlines[k], float(border[k]), bool(inside[k]), False)
             if there[k]:
                 z, R = self.dynamics.measured(*measure.measurement(fit, k, pose[k]))
                 tried = dynamics_tools.take(self.dynamics, self._expected[k], z, R, step.memory)
@@ -182,8 +187,10 @@ class GroundTracker:
                 ended.append(self._trimmed(track, "left the picture"))
             elif scale[k] > life.max_scale:
                 ended.append(self._trimmed(track, "left the measurable zone"))
-            elif track.refused_since is not None and self._t - track.refused_since > life.max_refused_s:
+            elif track.likeness < UNLIKE:
                 ended.append(self._trimmed(track, "no longer looks like itself"))
+            elif track.refused_since is not None and self._t - track.refused_since > life.max_refused_s:
+                ended.append(self._trimmed(track, "jumped"))
             elif self._t - track.last_measured > life.max_coast_s:
                 ended.append(self._trimmed(track, "lost"))
             else:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from visfuse_cli.maths import homography
 from visfuse_cli.maths.cameras import project
-from visfuse_cli.records import Array, GroundCamera
+from visfuse_cli.records import Array, GroundCamera, Region
 from visfuse_cli.tracking import measure
 from visfuse_cli.tracking.evidence import Boxes, Evidence
 from visfuse_cli.tracking.settings import SizePrior, TrackerSettings
@@ -19,6 +19,7 @@ from visfuse_cli.vision.contour import Look
 REACHES_PX = (24.0, 12.0, 6.0)  # how far around a hypothesis its border is looked for, coarse to fine
 BORDER_SEEN, AREA_MOVED = 0.6, 0.6  # shares of its border and its area that must be found
 CLEAR = 0.4  # share of its border that must have background outside: a window of a grey car has paint
+PART = 0.3  # how much more of these is wanted of a box that explains next to nothing
 UNMOVED = 0.5  # what a pixel that did not move counts against one that did
 UNUSUAL = 3.0  # deviations of a size from its class
 HEADING_SIGMA = 0.12  # rad: the course of a region's foot
@@ -35,16 +36,18 @@ class Guess:
 
 
 def best_guess(
-    camera: GroundCamera, settings: TrackerSettings, evidence: Evidence, box: Array, heading: float, taken: Boxes
+    camera: GroundCamera, settings: TrackerSettings, evidence: Evidence, region: Region, heading: float, taken: Boxes
 ) -> Guess | None:
-    """The box that explains most around a region's box [x0, y0, x1, y1] px, free of those `taken`; None if none fits.
+    """The box that explains most of a region, free of those `taken`; None if none fits.
 
-    Each class is tried with each end of the region aligned with its own, so that a shadow or a neighbour that the
-    region holds besides does no harm.
+    Each class is tried with each of its ends aligned with the region's, and with the ends of all that moves with it,
+    so that paint that is missing, a shadow or a neighbour does no harm.
     """
     classes = settings.target.classes
     priors = [measure.prior_arrays(prior) for prior in classes]
-    starts = [_aligned(camera, box, heading, mean) for mean, _ in priors]
+    starts = [
+        np.concatenate([_aligned(camera, box, heading, mean) for box in (region.box, region.around)]) for mean, _ in priors
+    ]
     which = np.repeat(np.arange(len(classes)), [len(start) for start in starts])
     pose = np.concatenate(starts)
     mean, sigma = (np.stack([pair[k] for pair in priors])[which] for k in (0, 1))
@@ -54,10 +57,14 @@ def best_guess(
         fit = measure.fit_poses(camera, look.outlines, pose, mean, sigma, settings.pose, HEADING_SIGMA)
         pose, size = np.where(fit.ok[:, None], fit.pose, pose), np.where(fit.ok[:, None], fit.size, size)
     usual = np.all(np.abs(size - mean) < UNUSUAL * sigma, axis=1)
-    good = fit.ok & usual & measure.looks_right(fit, look.outlines) & convincing(look)
+    area = _area(camera, pose, size) * look.open
+    # A window of a grey car looks like a small vehicle: what explains little of all that moves must be seen clearly.
+    doubt = 1 - np.clip(area * look.moved / max(region.around_area, 1.0), 0, 1)
+    clear = (look.border > BORDER_SEEN + PART * doubt) & (look.clear > CLEAR + PART * doubt)
+    good = fit.ok & usual & measure.looks_right(fit, look.outlines) & convincing(look) & clear
     if not good.any():
         return None
-    gain = _area(camera, pose, size) * look.open * (look.paint - UNMOVED * (1 - look.moved)) * look.border
+    gain = area * (look.paint - UNMOVED * (1 - look.moved)) * look.border
     best = int(np.argmax(np.where(good, gain, -np.inf)))
     return Guess(classes[which[best]], pose[best], size[best], sigma[best])
 
@@ -69,16 +76,17 @@ def convincing(look: Look) -> NDArray[np.bool_]:
 
 def _aligned(camera: GroundCamera, box: Array, heading: float, size: Array) -> Array:
     """Poses (6, 3) whose silhouettes share the left, middle or right and the lower or upper end of a region's box."""
+    low, extent = box[:2], box[2:]
     target = np.array([[u, v] for u in (0.0, 0.5, 1.0) for v in (1.0, 0.0)])
-    wanted = box[:2] + target * (box[2:] - box[:2])
+    wanted = low + target * extent
     centre = wanted.copy()
     ground_from_image = camera.ground.ground_from_image
     pose = np.zeros((len(target), 3))
     for _ in range(3):
         pose = np.column_stack([homography.apply(ground_from_image, centre), np.full(len(target), heading)])
         pixels, _ = project(camera, wireframe.corners(pose, np.tile(size, (len(pose), 1))))
-        low, high = pixels.min(axis=1), pixels.max(axis=1)
-        centre = centre + wanted - (low + target * (high - low))
+        first, last = pixels.min(axis=1), pixels.max(axis=1)
+        centre = centre + wanted - (first + target * (last - first))
     return pose[np.isfinite(pose).all(axis=1)]
 
 

@@ -65,12 +65,12 @@ def trace(
             z, R = dynamics.measured(*measure.measurement(fit, 0, pose[0]))
             z[2:] += np.pi  # the heading, where it is measured
             gamma = dynamics_tools.residual(dynamics, z, mean)
-            seen = mahalanobis(gamma, dynamics.H @ expected.prior.cov @ dynamics.H.T + R) < gate
+            seen = bool(mahalanobis(gamma, dynamics.H @ expected.prior.cov @ dynamics.H.T + R) < gate)
             if seen:
                 step = dynamics_tools.take(dynamics, expected, z, R, memory)
                 last_seen, memory = t, step.memory
         whole = bool(np.all((pixels > 1) & (pixels < np.array(camera.image_size) - 2.0)))
-        samples.append(Sample(frame, t, look.outlines[0], whole, seen))
+        samples.append(Sample(frame, t, look.outlines[0], float(look.border[0] * fit.agreed[0]), whole, seen))
         after = step.posterior.mean
         poses.append(np.array([after[0], after[1], dynamics.heading(after) - np.pi]))
         belief, before = step.posterior, t

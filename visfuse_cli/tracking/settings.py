@@ -86,8 +86,8 @@ class LifeSettings(Section):
     max_refused_s: float = Field(
         0.4, gt=0, le=60, description="s: measurements outside the gate in a row before a track ends"
     )
-    look_back_s: float = Field(2.0, ge=0, le=30, description="s: how far back a new track is followed to its beginning")
-    birth_scale: float = Field(0.8, gt=0, le=20, description="m of ground a pixel: further away no track starts")
+    look_back_s: float = Field(4.0, ge=0, le=30, description="s: how far back a new track is followed to its beginning")
+    birth_scale: float = Field(0.45, gt=0, le=20, description="m of ground a pixel: further away no track starts")
     max_scale: float = Field(1.0, gt=0, le=20, description="m of ground a pixel: further away nothing is tracked")
 
 

@@ -12,11 +12,13 @@ from visfuse_cli.vision.wireframe import Outlines
 
 @dataclass(slots=True)
 class Sample:
-    """One frame of a target: its outline, whether the whole of it was in view; `measured` when it was used."""
+    """One frame of a target: its outline, the share of its border that was found (NaN: hidden), whether the whole of
+    it was in view; `measured` when it was used."""
 
     frame: int
     t: float
     outline: Outlines
+    border: float
     whole: bool
     measured: bool
 
@@ -32,6 +34,7 @@ class Track:
     samples: list[Sample]
     steps: list[Step]
     last_measured: float
+    likeness: float = 1.0  # share of its border that was found lately
     refused: int = 0  # measurements that fell outside the gate
     refused_since: float | None = None  # s: since when all of them did
     ended_by: str = ""

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from visfuse_cli.maths.cameras import project
 from visfuse_cli.records import Array, GroundCamera, Image
@@ -67,7 +68,7 @@ class Look:
 
 
 def search(
-    labels: Image, owner: Image, code: Array, camera: GroundCamera, pose: Array, size: Array, reach: Array
+    labels: Image, owner: Image, code: NDArray[np.intp], camera: GroundCamera, pose: Array, size: Array, reach: Array
 ) -> Look:
     """Look for the outlines of N boxes with pose (N, 3) and size (N, 3), at most `reach` (N,) px off.
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -86,7 +86,7 @@ def find(
         cv2.subtract(mask, explained, mask)
         cv2.subtract(moved, explained, moved)
     contours, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
-    _, component = cv2.connectedComponents(moved, connectivity=4, ltype=cv2.CV_16U)
+    _, component, extent, _ = cv2.connectedComponentsWithStats(moved, connectivity=4, ltype=cv2.CV_16U)
     height, width = mask.shape
     scale = np.concatenate([np.full(band.bottom - band.top, band.scale) for band in cut])
     bodies: list[Region] = []
@@ -100,14 +100,19 @@ def find(
         border = at_border(hull, (width, height))
         if explained is not None:
             border |= _beside(hull, explained)
-        region = Region(box, hull, border, float(cv2.contourArea(contour)))
+        points = contour.reshape(-1, 2)
+        whose = np.bincount(component[points[:, 1], points[:, 0]])[1:]
+        number = int(np.argmax(whose)) + 1 if whose.any() else -1
+        area = float(cv2.contourArea(contour))
+        around, around_area = box, area
+        if number > 0:
+            around, around_area = extent[number, :4] - np.array([0.5, 0.5, 0, 0]), float(extent[number, 4])
+        region = Region(box, hull, border, area, around, around_area)
         metre = scale[y + h - 1]
         if w > BODY_M[0] * metre and h > BODY_M[1] * metre:
             bodies.append(region)
         else:
-            points = contour.reshape(-1, 2)
-            whose = np.bincount(component[points[:, 1], points[:, 0]])[1:]
-            parts.setdefault(int(np.argmax(whose)) if whose.any() else -1, []).append((region, metre))
+            parts.setdefault(number, []).append((region, metre))
     gathered = [*bodies, *(region for group in parts.values() for region in _gathered(group))]
     return [
         region
@@ -153,18 +158,21 @@ def joined(parts: list[Region]) -> Region:
     corner = np.min([part.box[:2] for part in parts], axis=0)
     far = np.max([part.box[:2] + part.box[2:] for part in parts], axis=0)
     box = np.concatenate([corner, far - corner])
-    return Region(box, points[kept], border[kept], sum(p.area for p in parts), max(p.score for p in parts))
+    return replace(parts[0], box=box, hull=points[kept], at_border=border[kept], area=sum(part.area for part in parts))
 
 
 def from_box(box: Array, score: float, frame_size: tuple[int, int]) -> Region:
     """A region from an external detection box [x, y, w, h] px."""
     x, y, w, h = box
     hull = np.array([[x, y], [x + w, y], [x + w, y + h], [x, y + h]])
-    return Region(np.asarray(box, dtype=float), hull, at_border(hull, frame_size), float(w * h), score, True)
+    return Region(np.asarray(box, dtype=float), hull, at_border(hull, frame_size), float(w * h), box, float(w * h), score, True)
 
 
 def undistorted(region: Region, lens: Lens) -> Region:
     """The region as a camera without distortion would see it."""
     hull = undistort_points(region.hull, lens)
     low, high = hull.min(axis=0) - 0.5, hull.max(axis=0) + 0.5
-    return Region(np.concatenate([low, high - low]), hull, region.at_border, region.area, region.score, region.upright)
+    u, v, w, h = region.around
+    ends = undistort_points(np.array([[u, v], [u + w, v], [u + w, v + h], [u, v + h]]), lens)
+    around = np.concatenate([ends.min(axis=0), np.ptp(ends, axis=0)])
+    return replace(region, box=np.concatenate([low, high - low]), hull=hull, around=around)

@@ -53,12 +53,16 @@ class Outlines:
 
 @dataclass(frozen=True, slots=True)
 class BoxFit:
-    """Fitted boxes: pose (N, 3) x, y m and theta rad; size (N, 3) l, w, h m; cov (N, 6, 6); rms (N,) px; ok (N,)."""
+    """Fitted boxes: pose (N, 3) x, y m and theta rad; size (N, 3) l, w, h m; cov (N, 6, 6); rms (N,) px; ok (N,).
+
+    agreed (N,) is the share of an outline's seen rows that lie within three deviations of the fitted box.
+    """
 
     pose: Array
     size: Array
     cov: Array
     rms: Array
+    agreed: Array
     ok: np.ndarray
 
     def __getitem__(self, which: object) -> BoxFit:
@@ -173,7 +177,8 @@ def fit(
     seen = valid.sum(axis=1)
     rms = np.sqrt(np.sum(np.where(valid, residual**2, 0), axis=1) / np.maximum(seen, 1))
     ok = (seen >= 3) & np.all(np.isfinite(x), axis=1)
-    return BoxFit(x[:, :3], x[:, 3:], np.asarray(np.linalg.inv(N)), rms, ok)
+    agreed = np.sum(valid & (np.abs(residual) < 3 * noise), axis=1) / np.maximum(seen, 1)
+    return BoxFit(x[:, :3], x[:, 3:], np.asarray(np.linalg.inv(N)), rms, agreed, ok)
 
 
 def silhouette(camera: GroundCamera, pose: Array, size: Array) -> Array:
