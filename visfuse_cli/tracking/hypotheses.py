@@ -20,7 +20,7 @@ REACHES_PX = (24.0, 12.0, 6.0)  # how far around a hypothesis its border is look
 BORDER_SEEN, AREA_MOVED = 0.6, 0.6  # shares of its border and its area that must be found
 CLEAR = 0.4  # share of its border that must have background outside: a window of a grey car has paint
 PART = 0.3  # how much more of these is wanted of a box that explains next to nothing
-UNMOVED = 0.5  # what a pixel that did not move counts against one that did
+SHADOW_ONLY, UNMOVED = 0.3, 0.5  # what a pixel of shadow, and one that did not move, counts against one of paint
 UNUSUAL = 3.0  # deviations of a size from its class
 HEADING_SIGMA = 0.12  # rad: the course of a region's foot
 
@@ -64,7 +64,7 @@ def best_guess(
     good = fit.ok & usual & measure.looks_right(fit, look.outlines) & convincing(look) & clear
     if not good.any():
         return None
-    gain = area * (look.paint - UNMOVED * (1 - look.moved)) * look.border
+    gain = area * (look.paint - SHADOW_ONLY * (look.moved - look.paint) - UNMOVED * (1 - look.moved)) * look.border
     best = int(np.argmax(np.where(good, gain, -np.inf)))
     return Guess(classes[which[best]], pose[best], size[best], sigma[best])
 

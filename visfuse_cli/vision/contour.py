@@ -25,7 +25,7 @@ UNKNOWN = 0  # evidence where another vehicle or the frame's border is in the wa
 CLEAR_PX = 2.5  # between a border and the background outside it
 OPEN = 0.7  # of a profile that must be visible to expect a border in it
 LEAST = 0.1  # of a border or an area that must be visible to say anything about it
-_INSIDE = np.random.default_rng(0).dirichlet(np.full(8, 0.6), 64)  # points within a box, as weights of its corners
+_RADII = np.sqrt((np.arange(5) + 0.5) / 5)  # from the middle of a silhouette to its border: equal areas
 
 
 def owners(camera: GroundCamera, pose: Array, size: Array) -> Image:
@@ -106,23 +106,28 @@ def search(
     outlines = Outlines(normal, support, EDGES[edge], share, valid, np.zeros(count, dtype=bool), total[:, -1] / np.pi)
 
     in_view = known.mean(axis=2) > OPEN
-    label, whose, inside = _look(labels, owner, camera, np.einsum("pc,nck->npk", _INSIDE, pixels))
-    own = inside & (whose == code[:, None])
+    middle = pixels.mean(axis=1)[:, None]
+    spokes = middle[..., None, :] + _RADII[:, None] * (at - middle)[:, :, None]  # (N, K, 5, 2)
+    label, whose, inside = _look(labels, owner, camera, spokes)
+    own = inside & (whose == code[:, None, None])
+    area = np.abs(np.sum(normal * (at - middle), axis=-1))[..., None] * np.ones(len(_RADII))
+    area /= np.maximum(area.sum(axis=(1, 2), keepdims=True), 1e-9)
     clear = valid & (np.abs(found[1] - nearest) < CLEAR_PX)
     return Look(
         outlines,
-        border=_share(valid & in_view, in_view),
-        clear=_share(clear, valid),
-        moved=_share(own & (label > 0), own),
-        paint=_share(own & (label == FOREGROUND), own),
-        open=own.mean(axis=1),
+        border=_share(valid & in_view, in_view, 1 / DIRECTIONS),
+        clear=_share(clear, valid, 1 / DIRECTIONS),
+        moved=_share(own & (label > 0), own, area),
+        paint=_share(own & (label == FOREGROUND), own, area),
+        open=np.sum(own * area, axis=(1, 2)),
     )
 
 
-def _share(part: np.ndarray, whole: np.ndarray) -> Array:
-    """Share (N,) of `part` in `whole` (N, K); NaN where `whole` is nearly nothing."""
-    enough = whole.mean(axis=1) > LEAST
-    return np.where(enough, part.sum(axis=1) / np.maximum(whole.sum(axis=1), 1), np.nan)
+def _share(part: np.ndarray, whole: np.ndarray, weight: Array | float) -> Array:
+    """Weighted share (N,) of `part` in `whole` (N, ...); NaN where `whole` is nearly nothing."""
+    axes = tuple(range(1, part.ndim))
+    every = np.sum(whole * weight, axis=axes)
+    return np.where(every > LEAST, np.sum(part * weight, axis=axes) / np.maximum(every, 1e-9), np.nan)
 
 
 def _look(
