@@ -15,7 +15,8 @@ from visfuse_cli.tracking import measure
 from visfuse_cli.tracking.association import claim, region_boxes
 from visfuse_cli.tracking.dynamics import Dynamics, Step
 from visfuse_cli.tracking.evidence import Boxes
-from visfuse_cli.tracking.hypotheses import HEADING_SIGMA, best_guess
+from visfuse_cli.tracking.hypotheses import HEADING_SIGMA, Guess, best_guess
+from visfuse_cli.tracking.joining import part_before
 from visfuse_cli.tracking.lookback import Recent, trace
 from visfuse_cli.tracking.settings import TrackerSettings
 from visfuse_cli.tracking.targets import Abandoned, Sample, Track
@@ -63,20 +64,25 @@ class Nursery:
                 self._extend(fresh, frame, t, region)
                 self._candidates.append(fresh)
 
-    def born(self, next_id: int, tracks: list[Track], recent: Recent, taken_at: Callable[[int], Boxes]) -> int:
-        """Add the candidates that are tracks from this frame on to `tracks`, numbered from `next_id`; the next id."""
+    def born(
+        self, next_id: int, tracks: list[Track], held: list[Track], recent: Recent, taken_at: Callable[[int], Boxes]
+    ) -> int:
+        """Add the candidates that are tracks from this frame on to `tracks`, numbered from `next_id`; the next id.
+
+        Those that go on from a track `held` take its number and its place.
+        """
         waiting = []
         for candidate in self._candidates:
             track = None
             t = candidate.samples[-1][1]
             if candidate.missed_since is None and t >= candidate.asked_again:
                 candidate.asked_again = t + ASK_AGAIN_S
-                track = self._confirmed(candidate, next_id, recent, taken_at)
+                track = self._confirmed(candidate, next_id, recent, taken_at, held)
             if track is None:
                 waiting.append(candidate)
             else:
                 tracks.append(track)
-                next_id += 1
+                next_id = max(next_id, track.id + 1)
         self._candidates = waiting
         return next_id
 
@@ -118,7 +124,12 @@ class Nursery:
                 candidate.anchors.append((t, float(X), float(Y), scale))
 
     def _confirmed(
-        self, candidate: Candidate, identity: int, recent: Recent, taken_at: Callable[[int], Boxes]
+        self,
+        candidate: Candidate,
+        identity: int,
+        recent: Recent,
+        taken_at: Callable[[int], Boxes],
+        held: list[Track],
     ) -> Track | None:
         """A track, when the candidate moved far and straight enough to tell its heading and a vehicle is seen there."""
         velocity = self._course(candidate)
@@ -130,18 +141,39 @@ class Nursery:
         guess = best_guess(camera, settings, evidence, candidate.region, heading, taken_at(frame))
         if guess is None:
             return None
+        return self.grown(guess, velocity, identity, recent, taken_at, held)
+
+    def grown(
+        self,
+        guess: Guess,
+        velocity: Array,
+        identity: int,
+        recent: Recent,
+        taken_at: Callable[[int], Boxes],
+        earlier: list[Track],
+    ) -> Track | None:
+        """A track from what was guessed in the last frame, followed back and joined to the one of the `earlier` tracks
+        that it goes on from; that one is taken out of the list. None when it was hardly seen before."""
+        camera, settings = self._camera, self._settings
         samples, pose = trace(camera, settings, self._dynamics, recent, taken_at, guess, velocity)
         used = np.array([sample.measured for sample in samples], dtype=bool)
         if used.sum() < settings.life.confirm_frames or used.mean() < SEEN:
             return None
         if np.hypot(*(pose[-1, :2] - pose[0, :2])) < settings.life.confirm_m:
             return None
+        for old in earlier:
+            before = part_before(old, self._dynamics, samples, pose, guess.size)
+            if before is not None:
+                samples, pose = before[0] + samples, np.concatenate([before[1], pose])
+                identity = old.id
+                earlier.remove(old)
+                break
+        used = np.array([sample.measured for sample in samples], dtype=bool)
         outlines = Outlines.stack([sample.outline for sample in samples])
         sized = measure.classify(camera, outlines[used], pose[used], settings.target.classes, settings.pose)[0]
         fit = measure.fit_poses(camera, outlines, pose, sized.size, np.full(3, 0.05), settings.pose, HEADING_SIGMA)
-        span = samples[-1].t - samples[0].t
-        velocity = (pose[-1, :2] - pose[0, :2]) / span
-        steps = self._replay(samples, fit, float(pose[0, 2]), velocity, sized.size)
+        first = velocity_at_start(samples, pose)
+        steps = self._replay(samples, fit, pose, first, sized.size)
         last = samples[int(np.flatnonzero(used)[-1])].t
         return Track(identity, sized.prior, sized.size, sized.size_sigma, samples, steps, last)
 
@@ -161,21 +193,27 @@ class Nursery:
         return np.asarray(velocity)
 
     def _replay(
-        self, samples: list[Sample], fit: wireframe.BoxFit, heading: float, velocity: Array, size: Array
+        self, samples: list[Sample], fit: wireframe.BoxFit, pose: Array, velocity: Array, size: Array
     ) -> list[Step]:
-        """Run the filter over the frames seen before confirmation."""
-        start = self._dynamics.begin(np.append(fit.pose[0, :2], heading), velocity)
+        """Run the filter over the frames seen before confirmation, poses (n, 3) in them being roughly known."""
+        start = self._dynamics.begin(np.append(fit.pose[0, :2], pose[0, 2]), velocity)
         steps = [Step(start, start, np.eye(len(start.mean)), None, None)]
         for k in range(1, len(samples)):
             dt = np.array([samples[k].t - samples[k - 1].t])
             expected = dynamics_tools.predict(self._dynamics, [steps[-1].posterior], dt, size[:1])[0]
-            if samples[k].measured:
-                pose, cov = measure.measurement(fit, k, np.append(fit.pose[k, :2], heading), HEADING_SIGMA)
-                z, R = self._dynamics.measured(pose, cov)
+            if samples[k].measured and fit.ok[k]:
+                predicted = np.append(fit.pose[k, :2], pose[k, 2])
+                z, R = self._dynamics.measured(*measure.measurement(fit, k, predicted, HEADING_SIGMA))
                 steps.append(dynamics_tools.take(self._dynamics, expected, z, R, steps[-1].memory))
             else:
                 steps.append(dynamics_tools.coast(expected, steps[-1].memory))
         return steps
+
+
+def velocity_at_start(samples: list[Sample], pose: Array) -> Array:
+    """Velocity (2,) m/s over the first second of a path (n, 3)."""
+    end = max(1, sum(sample.t - samples[0].t < 1.0 for sample in samples) - 1)
+    return np.asarray((pose[end, :2] - pose[0, :2]) / (samples[end].t - samples[0].t))
 
 
 def _abandoned(candidate: Candidate, reason: str) -> Abandoned:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from bisect import bisect_left
 from collections import deque
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,10 +15,12 @@ from visfuse_cli.maths.gaussian import mahalanobis
 from visfuse_cli.records import Array, GroundCamera
 from visfuse_cli.tracking import dynamics as dynamics_tools
 from visfuse_cli.tracking import measure
-from visfuse_cli.tracking.association import footprint_contains
+from visfuse_cli.tracking.association import claim, footprint_contains
 from visfuse_cli.tracking.births import Nursery
 from visfuse_cli.tracking.dynamics import Dynamics, Prediction, Step
 from visfuse_cli.tracking.evidence import Boxes, Evidence
+from visfuse_cli.tracking.hypotheses import best_guess, gain_of
+from visfuse_cli.tracking.joining import WAIT_S
 from visfuse_cli.tracking.lookback import Recent
 from visfuse_cli.tracking.settings import TrackerSettings
 from visfuse_cli.tracking.targets import Abandoned, Sample, Track
@@ -27,6 +30,8 @@ VAGUE_M = 1.5  # m: a pose less certain than this is no measurement
 YOUNG, LEAP = 12, 4.0  # frames after which one measurement may not change the velocity by more (m/s)
 SEEN_SHARE = 0.4  # of the unhidden area of a box that must have moved and of its border that must be found
 LIKENESS_S, UNLIKE = 0.4, 0.5  # s over which the share of the border that is found is averaged, and too little of it
+DOUBTFUL, AGAIN_S = 0.25, 0.5  # share of the border that is not clear, to look again, so many s later
+BETTER = 1.2  # times as much must another box explain
 LOOK_BACK_FRAMES = 120  # at most
 REACH_PX = (4.0, 24.0)  # how far from its prediction an outline is looked for
 
@@ -48,6 +53,7 @@ class GroundTracker:
         self._t = 0.0
         self._expected: list[Prediction] = []  # of each track, at the predicted time
         self._recent: Recent = deque()
+        self._held: list[Track] = []  # ended, but a new track may turn out to go on from them
 
     def predict(self, t: float) -> None:
         """Advance every track to time t (s)."""
@@ -67,14 +73,16 @@ class GroundTracker:
         if self.tracks:
             self._measure(frame, evidence)
         self._remember(frame, evidence)
+        self._reconsider(evidence)
         self._nursery.feed(frame, self._t, evidence.leftovers(*self._boxes()))
-        self.next_id = self._nursery.born(self.next_id, self.tracks, self._recent, self._boxes_at)
-        return self._end(), self._nursery.give_up(self._t)
+        self.next_id = self._nursery.born(self.next_id, self.tracks, self._held, self._recent, self._boxes_at)
+        self._held += self._end()
+        return self._released(), self._nursery.give_up(self._t)
 
     def finish(self) -> tuple[list[Track], list[Abandoned]]:
         """End everything that is still alive."""
         tracks = [self._trimmed(track, "end of footage") for track in self.tracks]
-        self.tracks = []
+        tracks, self.tracks, self._held = self._held + tracks, [], []
         return tracks, self._nursery.finish()
 
     def outlines(self) -> list[Array]:
@@ -86,10 +94,12 @@ class GroundTracker:
         pose = [self._pose_of(track.steps[-1].posterior.mean) for track in self.tracks]
         return np.array(pose).reshape(-1, 3), np.array([track.size for track in self.tracks]).reshape(-1, 3)
 
-    def _boxes_at(self, frame: int) -> Boxes:
-        """Pose (N, 3) and size (N, 3) of the tracks that were followed in a frame, there."""
+    def _boxes_at(self, frame: int, without: Track | None = None) -> Boxes:
+        """Pose (N, 3) and size (N, 3) of the tracks that were followed in a frame, there, but for one."""
         pose, size = [], []
         for track in self.tracks:
+            if track is without:
+                continue
             k = bisect_left(track.samples, frame, key=lambda sample: sample.frame)
             if k < len(track.samples) and track.samples[k].frame == frame:
                 pose.append(self._pose_of(track.steps[k].posterior.mean))
@@ -121,7 +131,9 @@ class GroundTracker:
             step = dynamics_tools.coast(self._expected[k], track.steps[-1].memory)
             if np.isfinite(border[k]):
                 elapsed = self._t - track.samples[-1].t
-                track.likeness += (border[k] - track.likeness) * min(1.0, elapsed / LIKENESS_S)
+                share = min(1.0, elapsed / LIKENESS_S)
+                track.likeness += (border[k] - track.likeness) * share
+                track.doubt += (1 - border[k] * np.nan_to_num(look.clear[k], nan=1.0) - track.doubt) * share
             sample = Sample(frame, self._t, look.outlines[k], float(border[k]), bool(inside[k]), False)
             if there[k]:
                 z, R = self.dynamics.measured(*measure.measurement(fit, k, pose[k]))
@@ -135,6 +147,42 @@ class GroundTracker:
                     track.refused_since = sample.t if track.refused_since is None else track.refused_since
             track.samples.append(sample)
             track.steps.append(step)
+
+    def _reconsider(self, evidence: Evidence) -> None:
+        """Look at the track with the most doubt about it as if it were new, and put the better guess in its place."""
+        due = [track for track in self.tracks if track.doubt > DOUBTFUL and self._t >= track.reconsidered + AGAIN_S]
+        if not due:
+            return
+        track = max(due, key=lambda each: each.doubt)
+        track.reconsidered = self._t
+        box = np.append(self._pose_of(track.steps[-1].posterior.mean), track.size)
+        frame = self._recent[-1][0]
+        taken = self._boxes_at(frame, without=track)
+        hull = wireframe.silhouette(self.camera, box[:3], box[3:])
+        if not len(hull):
+            return
+        regions = evidence.leftovers(*taken)
+        expected = np.concatenate([hull.min(axis=0), hull.max(axis=0)])[None]
+        found = claim(regions, expected)[0]
+        if found < 0:
+            return
+        guess = best_guess(self.camera, self.settings, evidence, regions[found], float(box[2]), taken)
+        if guess is None or guess.gain < BETTER * gain_of(self.camera, evidence, box[:3], box[3:], taken):
+            return
+        velocity = self.dynamics.planar(track.steps[-1].posterior.mean)[0][2:]
+        before = partial(self._boxes_at, without=track)
+        itself = [track]
+        better = self._nursery.grown(guess, velocity, track.id, self._recent, before, itself)
+        if better is not None and not itself:  # and no other vehicle that passes in front
+            better.reconsidered = self._t
+            self.tracks[self.tracks.index(track)] = better
+
+    def _released(self) -> list[Track]:
+        """The ended tracks that nothing can go on from any more."""
+        begin = self._recent[0][1]
+        done = [track for track in self._held if track.samples[-1].t < begin - WAIT_S]
+        self._held = [track for track in self._held if track.samples[-1].t >= begin - WAIT_S]
+        return done
 
     def _reach(self, pose: Array) -> Array:
         """How far off (N,) px the outlines may be: three deviations of the prediction."""

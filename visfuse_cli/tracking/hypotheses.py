@@ -27,12 +27,16 @@ HEADING_SIGMA = 0.12  # rad: the course of a region's foot
 
 @dataclass(frozen=True, slots=True)
 class Guess:
-    """A box that explains what one frame shows: class, pose (3,), size (3,) and its deviation (3,)."""
+    """A box that explains what one frame shows: class, pose (3,), size (3,) and its deviation (3,).
+
+    `gain` is how much it explains: px of paint, less px of shadow and of road.
+    """
 
     prior: SizePrior
     pose: Array
     size: Array
     size_sigma: Array
+    gain: float
 
 
 def best_guess(
@@ -46,7 +50,8 @@ def best_guess(
     classes = settings.target.classes
     priors = [measure.prior_arrays(prior) for prior in classes]
     starts = [
-        np.concatenate([_aligned(camera, box, heading, mean) for box in (region.box, region.around)]) for mean, _ in priors
+        np.concatenate([_aligned(camera, box, heading, mean) for box in (region.box, region.around)])
+        for mean, _ in priors
     ]
     which = np.repeat(np.arange(len(classes)), [len(start) for start in starts])
     pose = np.concatenate(starts)
@@ -64,9 +69,19 @@ def best_guess(
     good = fit.ok & usual & measure.looks_right(fit, look.outlines) & convincing(look) & clear
     if not good.any():
         return None
-    gain = area * (look.paint - SHADOW_ONLY * (look.moved - look.paint) - UNMOVED * (1 - look.moved)) * look.border
+    gain = _gain(look, area)
     best = int(np.argmax(np.where(good, gain, -np.inf)))
-    return Guess(classes[which[best]], pose[best], size[best], sigma[best])
+    return Guess(classes[which[best]], pose[best], size[best], sigma[best], float(gain[best]))
+
+
+def gain_of(camera: GroundCamera, evidence: Evidence, pose: Array, size: Array, taken: Boxes) -> float:
+    """How much one box with pose (3,) and size (3,) explains, as `Guess.gain`; NaN where it is hidden."""
+    look = evidence.probe(pose[None], size[None], np.array(REACHES_PX[-1:]), taken)
+    return float(_gain(look, _area(camera, pose[None], size[None]) * look.open)[0])
+
+
+def _gain(look: Look, area: Array) -> Array:
+    return area * (look.paint - SHADOW_ONLY * (look.moved - look.paint) - UNMOVED * (1 - look.moved)) * look.border
 
 
 def convincing(look: Look) -> NDArray[np.bool_]:

@@ -35,6 +35,8 @@ class Track:
     steps: list[Step]
     last_measured: float
     likeness: float = 1.0  # share of its border that was found lately
+    doubt: float = 0.0  # share of its border that was not found or has something moving outside, lately
+    reconsidered: float = -1.0  # s: when it was last compared with other boxes
     refused: int = 0  # measurements that fell outside the gate
     refused_since: float | None = None  # s: since when all of them did
     ended_by: str = ""

@@ -24,7 +24,9 @@ class SpeedSettings(Section):
     min_distance_m: float = Field(2.0, gt=0, le=1000, description="m: shortest way a speed is measured over")
     max_sigma: float = Field(0.15, gt=0, le=10, description="standard deviation over speed: above, too uncertain")
     max_acceleration: float = Field(9.0, gt=0, le=100, description="m/s^2: above, the track has jumped")
-    min_likeness: float = Field(0.7, ge=0, le=1, description="least share of its outline that must be found, on average")
+    min_likeness: float = Field(
+        0.7, ge=0, le=1, description="least share of its outline that must be found, on average"
+    )
     max_misfit: float = Field(0.2, gt=0, le=5, description="outline misfit over outline size: above, no such box")
     max_size_z: float = Field(4.0, gt=0, le=100, description="deviations of a size from its class")
     max_refused: float = Field(

@@ -165,7 +165,9 @@ def from_box(box: Array, score: float, frame_size: tuple[int, int]) -> Region:
     """A region from an external detection box [x, y, w, h] px."""
     x, y, w, h = box
     hull = np.array([[x, y], [x + w, y], [x + w, y + h], [x, y + h]])
-    return Region(np.asarray(box, dtype=float), hull, at_border(hull, frame_size), float(w * h), box, float(w * h), score, True)
+    return Region(
+        np.asarray(box, dtype=float), hull, at_border(hull, frame_size), float(w * h), box, float(w * h), score, True
+    )
 
 
 def undistorted(region: Region, lens: Lens) -> Region:

@@ -1,0 +1,52 @@
+"""Two stretches of one vehicle: which earlier track a new one goes on from."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from visfuse_cli.maths.angles import wrap
+from visfuse_cli.records import Array
+from visfuse_cli.tracking.dynamics import Dynamics
+from visfuse_cli.tracking.targets import Sample, Track
+
+CLOSE_M = 2.0  # between the places that both have for one moment
+DRIFT = 0.2  # m a metre driven unseen: drivers brake and accelerate
+ASIDE_M, TURNED = 1.5, 0.5  # m off the course and rad turned, while unseen
+SAME = 0.5  # share of the common frames in which one stands in the place of the other
+BELIEVED = 0.7  # share of the outline seen, on average, that makes an earlier stretch worth keeping
+WAIT_S = 3.0  # s unseen
+
+
+def part_before(
+    old: Track, dynamics: Dynamics, samples: list[Sample], pose: Array, size: Array
+) -> tuple[list[Sample], Array] | None:
+    """The part of an earlier track before a new one's samples with poses (n, 3): empty when the earlier one followed
+    the same vehicle wrongly, None when it followed another."""
+    was = np.stack([step.posterior.mean for step in old.steps])
+    place = np.column_stack([was[:, :2], dynamics.heading(was)])
+    begin = samples[0]
+    count = sum(sample.frame < begin.frame for sample in old.samples)
+    kept = old.samples[:count]
+    believed = [sample.border for sample in kept if sample.measured]
+    good = len(believed) > 0 and float(np.nanmean(believed)) >= BELIEVED
+    if count < len(old.samples):
+        index = {sample.frame: k for k, sample in enumerate(samples)}
+        common = [(k, index[s.frame]) for k, s in enumerate(old.samples) if s.frame in index]
+        mine, its = np.array(common).T
+        apart = np.linalg.norm(place[mine, :2] - pose[its, :2], axis=1)
+        if np.mean(apart < max(CLOSE_M, 0.6 * size[0])) < SAME:
+            return None
+        fits = count > 0 and apart[0] < CLOSE_M
+    else:
+        gap = begin.t - old.samples[-1].t
+        planar, _ = dynamics.planar(was[-1])
+        speed = max(float(np.hypot(*planar[2:])), 1e-6)
+        ahead = planar[2:] / speed
+        offset = pose[0, :2] - planar[:2] - gap * planar[2:]
+        along, across = float(offset @ ahead), float(ahead[0] * offset[1] - ahead[1] * offset[0])
+        turned = abs(wrap(pose[0, 2] - np.arctan2(ahead[1], ahead[0])))
+        near = abs(along) < CLOSE_M + DRIFT * gap * speed and abs(across) < ASIDE_M and turned < TURNED
+        fits = good and gap < WAIT_S and near
+        if not fits:
+            return None
+    return (kept, place[:count]) if fits and good else ([], np.zeros((0, 3)))
