@@ -31,6 +31,7 @@ YOUNG, LEAP = 12, 4.0  # frames after which one measurement may not change the v
 SEEN_SHARE = 0.4  # of the unhidden area of a box that must have moved and of its border that must be found
 LIKENESS_S, UNLIKE = 0.4, 0.5  # s over which the share of the border that is found is averaged, and too little of it
 DOUBTFUL, AGAIN_S = 0.25, 0.5  # share of the border that is not clear, to look again, so many s later
+KEPT = 0.9  # of its frames and of the outline seen in them a track keeps when its box is exchanged
 BETTER = 1.2  # times as much must another box explain
 LOOK_BACK_FRAMES = 120  # at most
 REACH_PX = (4.0, 24.0)  # how far from its prediction an outline is looked for
@@ -173,7 +174,7 @@ class GroundTracker:
         before = partial(self._boxes_at, without=track)
         itself = [track]
         better = self._nursery.grown(guess, velocity, track.id, self._recent, before, itself)
-        if better is not None and not itself:  # and no other vehicle that passes in front
+        if better is not None and not itself and _as_good(better, track):  # `itself`: not one that passes in front
             better.reconsidered = self._t
             self.tracks[self.tracks.index(track)] = better
 
@@ -261,3 +262,10 @@ class GroundTracker:
             track.steps.pop()
         track.ended_by = reason
         return track
+
+
+def _as_good(new: Track, old: Track) -> bool:
+    """Whether a track goes back nearly as far as the one whose place it takes and is seen as clearly."""
+    begin = new.samples[0].frame
+    seen = [[s.border for s in track.samples if s.frame >= begin and s.border >= 0] for track in (new, old)]
+    return len(new.samples) > KEPT * len(old.samples) and bool(np.sum(seen[0]) > KEPT * np.sum(seen[1]))
