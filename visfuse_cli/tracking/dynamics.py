@@ -69,9 +69,9 @@ def _bicycle(filter_: FilterSettings, adaptive: bool) -> Dynamics:
         return following, F, motion.bicycle_noise(x, dt, wheelbase, filter_.sigma_a, filter_.sigma_steer)
 
     def begin(pose: Array, velocity: Array) -> Gaussian:
-        speed = float(np.hypot(*velocity))
+        speed = float(velocity @ [np.cos(pose[2]), np.sin(pose[2])])  # negative: it reverses
         mean = np.array([pose[0], pose[1], speed, pose[2], 0.0])
-        return Gaussian(mean, np.diag([0.5, 0.5, max(1.5, 0.3 * speed), 0.2, 0.1]) ** 2)
+        return Gaussian(mean, np.diag([0.5, 0.5, max(1.5, 0.3 * abs(speed)), 0.2, 0.1]) ** 2)
 
     def planar(x: Array) -> tuple[Array, Array]:
         velocity, J = motion.bicycle_velocity(x)

@@ -12,6 +12,7 @@ from visfuse_cli.tracking.targets import Sample, Track
 CLOSE_M = 2.0  # between the places that both have for one moment
 DRIFT = 0.2  # m a metre driven unseen: drivers brake and accelerate
 ASIDE_M, TURNED = 1.5, 0.5  # m off the course and rad turned, while unseen
+HALF = 0.5  # of its length: a part of a vehicle that was followed as one lies that far off
 SAME = 0.5  # share of the common frames in which one stands in the place of the other
 BELIEVED = 0.7  # share of the outline seen, on average, that makes an earlier stretch worth keeping
 WAIT_S = 3.0  # s unseen
@@ -34,7 +35,8 @@ def part_before(
         common = [(k, index[s.frame]) for k, s in enumerate(old.samples) if s.frame in index]
         mine, its = np.array(common).T
         apart = np.linalg.norm(place[mine, :2] - pose[its, :2], axis=1)
-        if np.mean(apart < max(CLOSE_M, 0.6 * size[0])) < SAME:
+        turned = np.abs(wrap(place[mine, 2] - pose[its, 2]))
+        if np.mean((apart < max(CLOSE_M, HALF * size[0])) & (turned < TURNED)) < SAME:
             return None
         fits = count > 0 and apart[0] < CLOSE_M
     else:
