@@ -28,7 +28,8 @@ class Path:
     """A finished track over T frames, on the ground plane, metres and seconds.
 
     planar: (T, 4) X, Y, X', Y' with (T, 4, 4) covariance, calibration included; pose_cov: the same without it;
-    calibration: (T, 4, 9) d planar / d homography entries; pixel: (T, 2, 2) d ground / d image.
+    calibration: (T, 4, 9) d planar / d homography entries; pixel: (T, 2, 2) d ground / d image; size_pull: (T, 2, 3)
+    d position / d size of the fitted boxes, which differs where a box is partly out of view.
     """
 
     id: int
@@ -36,11 +37,12 @@ class Path:
     frame: np.ndarray
     t: Array
     measured: np.ndarray
-    whole: np.ndarray  # measured with the whole outline in view
     planar: Gaussian
     pose_cov: Array
     heading: Array
     size: Array
+    size_sigma: Array
+    size_pull: Array
     size_z: float  # how many deviations the size lies from its class, at worst
     calibration: Array
     pixel: Array
@@ -53,7 +55,8 @@ class Path:
 
 def conclude(track: Track, camera: GroundCamera, settings: TrackerSettings, dynamics: Dynamics) -> Path:
     """Settle a track's size, fit every frame again with it, and smooth; with `smooth` off, keep the causal states."""
-    samples, steps, size, misfit = track.samples, track.steps, track.size, np.nan
+    samples, steps, misfit = track.samples, track.steps, np.nan
+    size, size_sigma, size_pull = track.size, track.size_sigma, np.zeros((len(samples), 2, 3))
     nis = _nis(steps)
     class_name = track.prior_class.name
     measured = np.array([s.measured for s in samples])
@@ -64,8 +67,9 @@ def conclude(track: Track, camera: GroundCamera, settings: TrackerSettings, dyna
         outlines = Outlines.stack([s.outline for s in samples])
         used = measured
         sized = measure.classify(camera, outlines[used], pose[used], settings.target.classes, settings.pose)[0]
-        class_name, size = sized.prior.name, sized.size
+        class_name, size, size_sigma = sized.prior.name, sized.size, sized.size_sigma
         fit = measure.fit_poses(camera, outlines, pose, size, np.full(3, 0.01), settings.pose)
+        size_pull = fit.cov[:, :2, 3:] @ np.linalg.inv(fit.cov[:, 3:, 3:])
         misfit = float(np.median(fit.rms[used]))
         steps, measured = _filter_again(samples, steps, fit, pose, size, settings, dynamics)
         nis = _nis(steps)
@@ -82,11 +86,12 @@ def conclude(track: Track, camera: GroundCamera, settings: TrackerSettings, dyna
         frame=np.array([s.frame for s in samples]),
         t=np.array([s.t for s in samples]),
         measured=measured,
-        whole=measured & np.array([s.whole for s in samples]),
         planar=Gaussian(planar, cov),
         pose_cov=pose_cov,
         heading=dynamics.heading(belief.mean),
         size=size,
+        size_sigma=size_sigma,
+        size_pull=size_pull,
         size_z=_size_z(size, class_name, settings),
         calibration=calibration,
         pixel=pixel,

@@ -7,7 +7,6 @@ from collections import deque
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
 from visfuse_cli.maths.assignment import gate_size
 from visfuse_cli.maths.cameras import ground_scale, project
@@ -21,7 +20,7 @@ from visfuse_cli.tracking.dynamics import Dynamics, Prediction, Step
 from visfuse_cli.tracking.evidence import Boxes, Evidence
 from visfuse_cli.tracking.hypotheses import best_guess, gain_of
 from visfuse_cli.tracking.joining import WAIT_S
-from visfuse_cli.tracking.lookback import Recent
+from visfuse_cli.tracking.lookback import LEAST_OPEN, Recent
 from visfuse_cli.tracking.settings import TrackerSettings
 from visfuse_cli.tracking.targets import Abandoned, Sample, Track
 from visfuse_cli.vision import wireframe
@@ -124,10 +123,10 @@ class GroundTracker:
         size = np.array([track.size for track in self.tracks])
         sigma = np.array([track.size_sigma for track in self.tracks])
         look = evidence.look(pose, size, self._reach(pose))
-        inside = self._inside(pose, size)
         fit = measure.fit_poses(self.camera, look.outlines, pose, size, sigma, self.settings.pose)
         border = look.border * fit.agreed
         there = fit.ok & measure.looks_right(fit, look.outlines) & (look.moved > SEEN_SHARE) & ~(border < SEEN_SHARE)
+        there &= look.open > LEAST_OPEN
         for k, track in enumerate(self.tracks):
             step = dynamics_tools.coast(self._expected[k], track.steps[-1].memory)
             if np.isfinite(border[k]):
@@ -135,7 +134,7 @@ class GroundTracker:
                 share = min(1.0, elapsed / LIKENESS_S)
                 track.likeness += (border[k] - track.likeness) * share
                 track.doubt += (1 - border[k] * np.nan_to_num(look.clear[k], nan=1.0) - track.doubt) * share
-            sample = Sample(frame, self._t, look.outlines[k], float(border[k]), bool(inside[k]), False)
+            sample = Sample(frame, self._t, look.outlines[k], float(border[k]), False)
             if there[k]:
                 z, R = self.dynamics.measured(*measure.measurement(fit, k, pose[k]))
                 tried = dynamics_tools.take(self.dynamics, self._expected[k], z, R, step.memory)
@@ -192,12 +191,6 @@ class GroundTracker:
         spread = np.einsum("nij,njk,nik->n", J[:, :, :2], cov, J[:, :, :2])  # trace: px^2
         return np.clip(3 * np.sqrt(np.nan_to_num(spread)), *REACH_PX)
 
-    def _inside(self, pose: Array, size: Array) -> NDArray[np.bool_]:
-        """Which boxes (N,) lie wholly in the picture."""
-        pixels, _ = project(self.camera, wireframe.corners(pose, size))
-        limit = np.array(self.camera.image_size) - 2.0
-        return np.asarray(np.all((pixels > 1) & (pixels < limit), axis=(1, 2)))
-
     def _plausible(self, track: Track, step: Step, z: Array, R: Array) -> bool:
         """Enough outline to place the box, inside the gate, and no leap of speed."""
         if R[0, 0] + R[1, 1] > VAGUE_M**2:
@@ -224,7 +217,8 @@ class GroundTracker:
         pose, size = self._boxes()
         pixels, _ = project(self.camera, wireframe.corners(pose, size))
         low, high = pixels.min(axis=1), pixels.max(axis=1)
-        outside = ~np.all((high > 0) & (low < self.camera.image_size), axis=1)
+        inside = np.clip(np.minimum(high, self.camera.image_size) - np.maximum(low, 0), 0, None)
+        outside = ~(np.prod(inside, axis=1) > LEAST_OPEN * np.prod(high - low, axis=1))
         feet, _ = project(self.camera, np.column_stack([pose[:, :2], np.zeros(len(pose))]))
         scale = ground_scale(self.camera, feet)
         life = self.settings.life

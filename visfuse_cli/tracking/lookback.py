@@ -21,6 +21,7 @@ from visfuse_cli.tracking.targets import Sample
 from visfuse_cli.vision import wireframe
 
 REACH_PX = (4.0, 20.0)
+LEAST_OPEN = 0.2  # of a box in view to measure it
 LOST_S = 0.3  # s without the thing: it was not there before
 
 Recent = deque[tuple[int, float, Evidence]]  # frame, t and what it showed, oldest first
@@ -60,7 +61,12 @@ def trace(
         look = evidence.probe(pose, size, np.clip(3 * spread, *REACH_PX)[None], taken_at(frame))
         fit = measure.fit_poses(camera, look.outlines, pose, size, guess.size_sigma, settings.pose)
         step = dynamics_tools.coast(expected, memory)
-        seen = bool(fit.ok[0] & measure.looks_right(fit, look.outlines)[0] & hypotheses.convincing(look)[0])
+        seen = bool(
+            fit.ok[0]
+            & measure.looks_right(fit, look.outlines)[0]
+            & hypotheses.convincing(look)[0]
+            & (look.open[0] > LEAST_OPEN)
+        )
         if seen:
             z, R = dynamics.measured(*measure.measurement(fit, 0, pose[0]))
             z[2:] += np.pi  # the heading, where it is measured
@@ -69,8 +75,7 @@ def trace(
             if seen:
                 step = dynamics_tools.take(dynamics, expected, z, R, memory)
                 last_seen, memory = t, step.memory
-        whole = bool(np.all((pixels > 1) & (pixels < np.array(camera.image_size) - 2.0)))
-        samples.append(Sample(frame, t, look.outlines[0], float(look.border[0] * fit.agreed[0]), whole, seen))
+        samples.append(Sample(frame, t, look.outlines[0], float(look.border[0] * fit.agreed[0]), seen))
         after = step.posterior.mean
         poses.append(np.array([after[0], after[1], dynamics.heading(after) - np.pi]))
         belief, before = step.posterior, t

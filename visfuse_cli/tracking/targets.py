@@ -12,14 +12,12 @@ from visfuse_cli.vision.wireframe import Outlines
 
 @dataclass(slots=True)
 class Sample:
-    """One frame of a target: its outline, the share of its border that was found (NaN: hidden), whether the whole of
-    it was in view; `measured` when it was used."""
+    """One frame of a target: its outline, the share of its border that was found (NaN: hidden)."""
 
     frame: int
     t: float
     outline: Outlines
     border: float
-    whole: bool
     measured: bool
 
 

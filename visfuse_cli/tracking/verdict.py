@@ -13,6 +13,7 @@ from visfuse_cli.records import Array
 from visfuse_cli.tracking.conclude import Path
 
 Z95 = 1.959964
+SIZE_DOUBT = 0.03  # of a size: no vehicle is quite a box
 GOOD_ENOUGH, LONGER_FOR = 0.01, 1.5  # standard deviation of a speed over itself
 
 
@@ -71,10 +72,7 @@ def _best_stretch(
     path: Path, length: Array, tangent: Array, entry_cov: Array, bias_px: float, settings: SpeedSettings
 ) -> tuple[int, int, float]:
     """First and last state, and the deviation of the mean speed between them (m/s)."""
-    # A vehicle cut off by the frame's edge is placed by its supposed size: good to follow it, not to time it.
-    seen = np.flatnonzero(path.whole)
-    if len(seen) < settings.min_frames:
-        seen = np.flatnonzero(path.measured)
+    seen = np.flatnonzero(path.measured)
     grid = np.unique(seen[np.linspace(0, len(seen) - 1, min(len(seen), 48)).astype(int)])
     i, j = (index.ravel() for index in np.meshgrid(grid, grid, indexing="ij"))
     duration, distance = path.t[j] - path.t[i], length[j] - length[i]
@@ -92,8 +90,11 @@ def _best_stretch(
     calibration = np.einsum("sh,hk,sk->s", g, entry_cov, g)
     slip = np.einsum("td,tdp->tp", tangent, path.pixel)  # m along the way for a pixel
     bias = bias_px**2 * np.sum((slip[j] - slip[i]) ** 2, axis=1)
+    stretch = np.einsum("td,tdp->tp", tangent, path.size_pull)  # m along the way for a metre of size
+    doubt_of_size = np.hypot(path.size_sigma, SIZE_DOUBT * path.size)
+    size = np.sum((doubt_of_size * (stretch[j] - stretch[i])) ** 2, axis=1)
     stamps = 2 * (distance / np.maximum(duration, 1e-9) * settings.sigma_t_s) ** 2
-    sigma_way = np.sqrt(pose + np.clip(calibration, 0, None) + bias + stamps)
+    sigma_way = np.sqrt(pose + np.clip(calibration, 0, None) + bias + size + stamps)
     doubt = sigma_way / np.maximum(distance, 1e-3)
     good = doubt <= max(LONGER_FOR * float(doubt.min()), GOOD_ENOUGH)
     best = int(np.argmax(np.where(good, distance, -np.inf)))
