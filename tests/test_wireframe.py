@@ -33,7 +33,14 @@ def outlines_of(camera, pose, size, noise=0.0, seed=0):
     pixels, _ = project(camera, wireframe.corners(pose, np.tile(size, (len(pose), 1))))
     support = np.max(pixels @ FAN.T, axis=1)
     support = support + np.random.default_rng(seed).normal(0, noise, support.shape)
-    return Outlines(support, np.ones(support.shape, dtype=bool))
+    return tangent_rows(support, np.ones(support.shape, dtype=bool))
+
+
+def tangent_rows(support, valid):
+    n = len(support)
+    nowhere = np.zeros((n, DIRECTIONS, 2), dtype=int)
+    width = 2 * support.mean(axis=1)
+    return Outlines(np.tile(FAN, (n, 1, 1)), support, nowhere, 0.0 * support, valid, np.ones(n, dtype=bool), width)
 
 
 def fit(camera, outlines, start, size, size_sigma, sigma_px=1.5):
@@ -104,7 +111,7 @@ def test_box_cut_off_at_the_bottom_is_placed_by_its_size():
     camera, pose = road_camera(), passing_cars(10)
     outlines = outlines_of(camera, pose, CAR, noise=0.5)
     downward = FAN[:, 1] > 0.2
-    cut = Outlines(outlines.support, np.tile(~downward, (len(pose), 1)))
+    cut = tangent_rows(outlines.support, np.tile(~downward, (len(pose), 1)))
     found = fit(camera, cut, pose + [0.3, 0.5, 0.02], CAR, 0.02)
     assert np.abs(found.pose - pose)[:, 1].max() < 1.0
     assert (found.cov[:, 1, 1] > fit(camera, outlines, pose, CAR, 0.02).cov[:, 1, 1]).all()
@@ -112,7 +119,22 @@ def test_box_cut_off_at_the_bottom_is_placed_by_its_size():
 
 def test_outline_counts_only_what_the_picture_holds():
     hull = np.array([[0.0, 100], [50, 60], [90, 150], [40, 200]])
-    support, valid = wireframe.outline(hull, np.array([True, False, False, False]))
-    assert support.shape == (DIRECTIONS,)
-    assert not valid[DIRECTIONS // 2]  # leftmost point lies on the frame's edge
-    assert valid[0]
+    found = wireframe.tangents(hull, np.array([True, False, False, False]))
+    assert found.support.shape == (DIRECTIONS,)
+    assert found.support[0] == pytest.approx(90)
+    assert not found.valid[DIRECTIONS // 2]  # leftmost point lies on the frame's edge
+    assert found.valid[0]
+    assert wireframe.tangents(hull, np.zeros(4, dtype=bool), upright=True).valid.sum() == 4
+    assert wireframe.tangents(hull, np.zeros(4, dtype=bool), border_px=2.0).support[0] == pytest.approx(92)
+
+
+def test_only_edges_between_a_seen_and_an_unseen_face_border_the_silhouette():
+    camera, pose = road_camera(), passing_cars(10)
+    size = np.tile(CAR, (len(pose), 1))
+    border = wireframe.silhouette_edges(camera, pose, size)
+    pixels, _ = project(camera, wireframe.corners(pose, size))
+    for k in range(len(pose)):
+        hull = wireframe.silhouette(camera, pose[k], size[k])
+        around = np.linalg.norm(hull - np.roll(hull, 1, axis=0), axis=1).sum()
+        ends = pixels[k, wireframe.EDGES[border[k]]]
+        assert np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1).sum() == pytest.approx(around, rel=0.01)

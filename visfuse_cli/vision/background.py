@@ -11,7 +11,8 @@ import numpy as np
 from visfuse_cli.records import Array, Image
 
 FOREGROUND, SHADOW = 255, 127
-AGREE = 1 / 3  # of the pictures of a scene that show a pixel without traffic, at least
+GROUPS = (0.9, 0.75, 0.6, 0.5, 0.4, 0.3)  # shares of a scene's pictures that may show the same
+ALIKE = 16  # grey levels between the least and the largest of the same
 LEARN_EVERY = 4  # frames: learning costs as much as looking
 
 
@@ -63,18 +64,32 @@ class Background:
 
 
 def empty_picture(images: Iterable[Image]) -> Image:
-    """The scene without its traffic: per pixel and channel, the middle of where most of a few pictures agree.
+    """The scene without its traffic: per pixel and channel, the middle of the values that most of the pictures share.
 
-    The narrowest interval that holds a third of the values is the road even where vehicles cover it most of the time.
+    The largest group of values that are alike is the road, also where vehicles cover it more than half of the time.
     """
     stack = np.stack(list(images))
-    count = len(stack)
-    held = max(1, round(AGREE * count))
-    rows = max(1, 4_000_000 // (count * stack.shape[2] * 3))
     picture = np.empty(stack.shape[1:], np.uint8)
+    rows = max(1, 4_000_000 // (stack.shape[0] * stack.shape[2] * 3))
     for top in range(0, stack.shape[1], rows):
-        value = np.sort(stack[:, top : top + rows], axis=0)
-        narrowest = np.argmin(value[held - 1 :] - value[: count - held + 1], axis=0)
-        middle = (narrowest + (held - 1) // 2)[None]
-        picture[top : top + rows] = np.take_along_axis(value, middle, axis=0)[0]
+        part = np.sort(stack[:, top : top + rows], axis=0)
+        picture[top : top + rows] = _commonest(part.reshape(len(part), -1)).reshape(part.shape[1:])
     return picture
+
+
+def _commonest(value: Image) -> Image:
+    """The middle (m,) of the largest group of alike values in each column of `value` (n, m), sorted."""
+    count = len(value)
+    found = np.empty(value.shape[1], np.uint8)
+    left = np.arange(value.shape[1])
+    for share in GROUPS:
+        held = max(1, round(share * count))
+        width = value[held - 1 :] - value[: count - held + 1]
+        first = np.argmin(width, axis=0)
+        columns = np.arange(value.shape[1])
+        found[left] = value[first + (held - 1) // 2, columns]
+        loose = width[first, columns] > ALIKE
+        if not loose.any():
+            break
+        value, left = value[:, loose], left[loose]
+    return found
