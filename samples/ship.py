@@ -11,7 +11,7 @@ from samples.road import free_flow
 from samples.scene import Scene, Vehicle, share_inside
 
 SAMPLE = Path(__file__).parents[1] / "visfuse_cli" / "apps" / "sample"
-SEED = 12
+SEED = 7
 SECONDS, SIZE, EVERY_S = 10.0, (960, 540), 2.2
 POINT_NOISE_PX, CRF = 0.3, 19
 

@@ -116,11 +116,13 @@ def test_nearer_vehicles_are_drawn_last():
     boxes = [(v, v.corners(v.trajectory(scene.times[-1:])[0])) for v in scene.vehicles]
     order = [v.id for v, _ in far_to_near(scene.camera, boxes)]
     assert sorted(order) == sorted(v.id for v in scene.vehicles)
+    eye = (scene.camera.centre[:2] - scene.placement.offset) @ scene.placement.rotation
     lanes: dict[float, list[tuple[float, int]]] = {}
     for vehicle, box in boxes:
         middle = (box[:4, :2].mean(axis=0) - scene.placement.offset) @ scene.placement.rotation
-        if middle[1] > 0:
+        if middle[1] > eye[1] + 10:
             lanes.setdefault(round(float(middle[0]), 3), []).append((float(middle[1]), vehicle.id))
+    assert max(map(len, lanes.values())) > 2
     for lane in lanes.values():
         places = [order.index(number) for _, number in sorted(lane, reverse=True)]
         assert places == sorted(places)
