@@ -22,14 +22,15 @@ from visfuse_cli.tracking.hypotheses import best_guess, gain_of
 from visfuse_cli.tracking.joining import WAIT_S
 from visfuse_cli.tracking.lookback import LEAST_OPEN, Recent
 from visfuse_cli.tracking.settings import TrackerSettings
-from visfuse_cli.tracking.targets import Abandoned, Sample, Track
+from visfuse_cli.tracking.targets import Abandoned, Comparison, Sample, Track
 from visfuse_cli.vision import wireframe
 
 VAGUE_M = 1.5  # m: a pose less certain than this is no measurement
 YOUNG, LEAP = 12, 4.0  # frames after which one measurement may not change the velocity by more (m/s)
 SEEN_SHARE = 0.4  # of the unhidden area of a box that must have moved and of its border that must be found
 LIKENESS_S, UNLIKE = 0.4, 0.5  # s over which the share of the border that is found is averaged, and too little of it
-DOUBTFUL, AGAIN_S = 0.25, 0.5  # share of the border that is not clear, to look again, so many s later
+DOUBTFUL, MOVED_M = 0.25, 2.0  # share of the border that is not clear, to compare, and again so many m further
+WAIT_AT_MOST_S = 1.0  # before a doubtful track is compared again
 KEPT = 0.9  # of its frames and of the outline seen in them a track keeps when its box is exchanged
 BETTER = 1.2  # times as much must another box explain
 LOOK_BACK_FRAMES = 120  # at most
@@ -150,12 +151,14 @@ class GroundTracker:
 
     def _reconsider(self, evidence: Evidence) -> None:
         """Look at the track with the most doubt about it as if it were new, and put the better guess in its place."""
-        due = [track for track in self.tracks if track.doubt > DOUBTFUL and self._t >= track.reconsidered + AGAIN_S]
+        due = [track for track in self.tracks if track.doubt > DOUBTFUL and self._comparable(track)]
         if not due:
             return
         track = max(due, key=lambda each: each.doubt)
-        track.reconsidered = self._t
         box = np.append(self._pose_of(track.steps[-1].posterior.mean), track.size)
+        track.compared = Comparison(
+            self._t + track.compared.wait, box[:2], min(2 * track.compared.wait, WAIT_AT_MOST_S)
+        )
         frame = self._recent[-1][0]
         taken = self._boxes_at(frame, without=track)
         hull = wireframe.silhouette(self.camera, box[:3], box[3:])
@@ -174,8 +177,12 @@ class GroundTracker:
         itself = [track]
         better = self._nursery.grown(guess, velocity, track.id, self._recent, before, itself)
         if better is not None and not itself and _as_good(better, track):  # `itself`: not one that passes in front
-            better.reconsidered = self._t
+            better.compared = track.compared
             self.tracks[self.tracks.index(track)] = better
+
+    def _comparable(self, track: Track) -> bool:
+        way = track.steps[-1].posterior.mean[:2] - track.compared.place
+        return self._t >= track.compared.due and float(np.hypot(*way)) > MOVED_M
 
     def _released(self) -> list[Track]:
         """The ended tracks that nothing can go on from any more."""

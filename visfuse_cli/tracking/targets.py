@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+
+import numpy as np
 
 from visfuse_cli.records import Array
 from visfuse_cli.tracking.dynamics import Step
@@ -22,6 +24,15 @@ class Sample:
 
 
 @dataclass(slots=True)
+class Comparison:
+    """When (s) a track's box is to be compared with others again, where (2,) m it last was, and the wait (s) after."""
+
+    due: float = -np.inf
+    place: Array = field(default_factory=lambda: np.full(2, np.inf))
+    wait: float = 0.5
+
+
+@dataclass(slots=True)
 class Track:
     """A confirmed target: its samples, one filter step for each, and the belief of its size (m)."""
 
@@ -34,7 +45,7 @@ class Track:
     last_measured: float
     likeness: float = 1.0  # share of its border that was found lately
     doubt: float = 0.0  # share of its border that was not found or has something moving outside, lately
-    reconsidered: float = -1.0  # s: when it was last compared with other boxes
+    compared: Comparison = field(default_factory=Comparison)  # with other boxes
     refused: int = 0  # measurements that fell outside the gate
     refused_since: float | None = None  # s: since when all of them did
     ended_by: str = ""

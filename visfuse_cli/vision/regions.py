@@ -53,18 +53,28 @@ def bands(camera: GroundCamera) -> list[Band]:
     return [Band(int(a), int(b), float(2 ** (octave[a] / 2))) for a, b in zip(starts, ends, strict=True)]
 
 
-def _vehicle_mask(labels: Image, cut: list[Band], gap_m: float, speck_m: float) -> Image:
-    """Foreground without specks, its gaps closed up to `gap_m`."""
-    out = np.empty_like(labels)
+def _vehicle_mask(labels: Image, cut: list[Band], gap_m: float, speck_m: float, explained: Image | None) -> Image:
+    """Foreground without specks and what is `explained` (255), its gaps closed up to `gap_m`."""
+    cleaned = np.empty_like(labels)
     for band in cut:
-        opening, closing = _kernel(max(speck_m * band.scale, LEAST_OPENING_PX)), _kernel(gap_m * band.scale)
-        margin = max(len(closing), len(opening))
-        top, bottom = max(0, band.top - margin), min(len(labels), band.bottom + margin)
+        opening = _kernel(max(speck_m * band.scale, LEAST_OPENING_PX))
+        top, bottom = max(0, band.top - len(opening)), min(len(labels), band.bottom + len(opening))
         mask = cv2.compare(labels[top:bottom], FOREGROUND, cv2.CMP_EQ)
         mask = cv2.morphologyEx(mask, cv2.MORPH_OPEN, opening)
-        mask = cv2.morphologyEx(mask, cv2.MORPH_CLOSE, closing)
-        out[band.top : band.bottom] = mask[band.top - top : band.bottom - top]
-    return out
+        cleaned[band.top : band.bottom] = mask[band.top - top : band.bottom - top]
+    if explained is not None:
+        cv2.subtract(cleaned, explained, cleaned)
+    out = np.zeros_like(labels)
+    for band in cut:
+        closing = _kernel(gap_m * band.scale)
+        margin = len(closing)
+        top, bottom = max(0, band.top - margin), min(len(labels), band.bottom + margin)
+        left, _, wide, _ = cv2.boundingRect(cleaned[top:bottom])
+        across = slice(max(0, left - margin), left + wide + margin)
+        if wide:
+            mask = cv2.morphologyEx(cleaned[top:bottom, across], cv2.MORPH_CLOSE, closing)
+            out[band.top : band.bottom, across] = mask[band.top - top : band.bottom - top]
+    return out if explained is None else cv2.subtract(out, explained)
 
 
 def _kernel(size: float) -> Image:
@@ -80,13 +90,14 @@ def find(
     Lengths are metres at each band's scale; hulls run through pixel centres. What is `explained` (255) belongs to no
     region; hull points beside it count as on the border.
     """
-    mask = _vehicle_mask(labels, cut, gap_m, speck_m)
+    mask = _vehicle_mask(labels, cut, gap_m, speck_m, explained)
+    contours, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
+    if not contours:
+        return []
     moved = cv2.morphologyEx(cv2.min(labels, 1), cv2.MORPH_OPEN, _kernel(LEAST_OPENING_PX))
     if explained is not None:
-        cv2.subtract(mask, explained, mask)
         cv2.subtract(moved, explained, moved)
-    contours, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
-    _, component, extent, _ = cv2.connectedComponentsWithStats(moved, connectivity=4, ltype=cv2.CV_16U)
+    components = _Components(moved)
     height, width = mask.shape
     scale = np.concatenate([np.full(band.bottom - band.top, band.scale) for band in cut])
     bodies: list[Region] = []
@@ -100,13 +111,8 @@ def find(
         border = at_border(hull, (width, height))
         if explained is not None:
             border |= _beside(hull, explained)
-        points = contour.reshape(-1, 2)
-        whose = np.bincount(component[points[:, 1], points[:, 0]])[1:]
-        number = int(np.argmax(whose)) + 1 if whose.any() else -1
         area = float(cv2.contourArea(contour))
-        around, around_area = box, area
-        if number > 0:
-            around, around_area = extent[number, :4] - np.array([0.5, 0.5, 0, 0]), float(extent[number, 4])
+        number, around, around_area = components.around(contour.reshape(-1, 2)) or (-1, box, area)
         region = Region(box, hull, border, area, around, around_area)
         metre = scale[y + h - 1]
         if w > BODY_M[0] * metre and h > BODY_M[1] * metre:
@@ -119,6 +125,27 @@ def find(
         for region in gathered
         if np.max(region.box[2:]) >= smallest_m * scale[min(int(region.box[1] + region.box[3]), height - 1)]
     ]
+
+
+class _Components:
+    """The connected parts of a mask (1), found one by one as they are asked for."""
+
+    def __init__(self, mask: Image) -> None:
+        self._number = mask.astype(np.int32)
+        self._extent: list[tuple[Array, float]] = []
+
+    def around(self, points: NDArray[np.int32]) -> tuple[int, Array, float] | None:
+        """Number, box (4,) px and area px^2 of the part that `points` (k, 2) of a contour lie in; None if in none."""
+        inside = points[self._number[points[:, 1], points[:, 0]] > 0]
+        if not len(inside):
+            return None
+        u, v = inside[len(inside) // 2]
+        if self._number[v, u] == 1:
+            number = len(self._extent) + 2
+            area, _, _, rect = cv2.floodFill(self._number, None, (int(u), int(v)), number, flags=4)
+            self._extent.append((np.array(rect) - [0.5, 0.5, 0, 0], float(area)))
+        number = int(self._number[v, u])
+        return number, *self._extent[number - 2]
 
 
 def _gathered(parts: list[tuple[Region, float]]) -> list[Region]:

@@ -24,6 +24,8 @@ EDGES = np.array([(0, 1), (1, 3), (3, 2), (2, 0), (4, 5), (5, 7), (7, 6), (6, 4)
 # The faces that meet in each edge: rear, front, right, left, bottom, top.
 _MEET = np.array([(0, 4), (3, 4), (1, 4), (2, 4), (0, 5), (3, 5), (1, 5), (2, 5), (0, 2), (0, 3), (1, 2), (1, 3)])
 
+SETTLED = 1e-3  # m and rad: a smaller step changes nothing
+
 
 @dataclass(frozen=True, slots=True)
 class Outlines:
@@ -174,6 +176,8 @@ def fit(
         limit = np.minimum(1, 2.0 / np.maximum(np.linalg.norm(step[:, :2], axis=1), 1e-9))
         x = x + step * limit[:, None]
         x[:, 3:] = np.maximum(x[:, 3:], 0.2)
+        if np.abs(step).max() < SETTLED:
+            break
     seen = valid.sum(axis=1)
     rms = np.sqrt(np.sum(np.where(valid, residual**2, 0), axis=1) / np.maximum(seen, 1))
     ok = (seen >= 3) & np.all(np.isfinite(x), axis=1)
