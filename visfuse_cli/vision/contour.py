@@ -23,6 +23,8 @@ STEPS = 12  # places either side of the expected edge
 SURE = 4  # places either side of the found one that must agree
 UNKNOWN = 0  # evidence where another vehicle or the frame's border is in the way
 CLEAR_PX = 2.5  # between a border and the background outside it
+SOLID = 0.8  # of what lies inside a border must be paint to take what lies outside for shadow
+GROUND_EDGES = 4  # the first of the EDGES lie on the ground
 OPEN = 0.7  # of a profile that must be visible to expect a border in it
 LEAST = 0.1  # of a border or an area that must be visible to say anything about it
 _RADII = np.sqrt((np.arange(5) + 0.5) / 5)  # from the middle of a silhouette to its border: equal areas
@@ -101,6 +103,8 @@ def search(
     for k, moved in enumerate((label == FOREGROUND, label > 0)):  # shadow is outside, or it is grey paint
         found[k] = _border(np.where(known, 2 * moved - 1, UNKNOWN), offset)
     nearest = np.where(np.abs(found[1]) < np.abs(np.nan_to_num(found[0], nan=np.inf)), found[1], found[0])
+    under = _stands_in_shadow(label, known, offset, found, edge < GROUND_EDGES)
+    nearest = np.where(under, found[0], nearest)
     valid = np.isfinite(nearest)
     support = np.sum(normal * at, axis=-1) + np.nan_to_num(nearest)
     outlines = Outlines(normal, support, EDGES[edge], share, valid, np.zeros(count, dtype=bool), total[:, -1] / np.pi)
@@ -112,7 +116,7 @@ def search(
     own = inside & (whose == code[:, None, None])
     area = np.abs(np.sum(normal * (at - middle), axis=-1))[..., None] * np.ones(len(_RADII))
     area /= np.maximum(area.sum(axis=(1, 2), keepdims=True), 1e-9)
-    clear = valid & (np.abs(found[1] - nearest) < CLEAR_PX)
+    clear = valid & (under | (np.abs(found[1] - nearest) < CLEAR_PX))
     return Look(
         outlines,
         border=_share(valid & in_view, in_view, 1 / DIRECTIONS),
@@ -121,6 +125,19 @@ def search(
         paint=_share(own & (label == FOREGROUND), own, area),
         open=np.sum(own * area, axis=(1, 2)),
     )
+
+
+def _stands_in_shadow(
+    label: np.ndarray, known: np.ndarray, offset: Array, found: Array, ground: NDArray[np.bool_]
+) -> NDArray[np.bool_]:
+    """Which rows (N, K) on `ground` edges end in the shadow a vehicle stands in: above it there is solid paint.
+
+    A grey vehicle looks like shadow too, but then its paint is no more than its windows, lamps and wheels.
+    """
+    both = ground & (found[1] - found[0] > CLEAR_PX)
+    inside = known & both[..., None] & (offset[:, None] < np.nan_to_num(found[0])[..., None])
+    solid = np.sum(inside & (label == FOREGROUND), axis=(1, 2)) > SOLID * np.sum(inside, axis=(1, 2))
+    return np.asarray(both & solid[:, None])
 
 
 def _share(part: np.ndarray, whole: np.ndarray, weight: Array | float) -> Array:
