@@ -225,10 +225,11 @@ class _MovingRegions:
         settings = clip.config.background
         self._clip = clip
         self._bands = region_tools.bands(clip.camera)
-        self._background = Background(settings.model, settings.threshold, settings.shadow_ratio)
+        self._background = Background(
+            settings.model, settings.threshold, settings.shadow_ratio, settings.memory_s
+        )
         with run_.stage("warm up"):
             self._background.start(empty_picture(_sampled(clip.source, settings.warmup_s)))
-        self._t = 0.0
 
     def evidence(self, frame: Frame) -> Evidence:
         labels = self._background.detect(frame.image)
@@ -236,11 +237,10 @@ class _MovingRegions:
         return LabelEvidence(labels, self._clip.camera, self._bands, settings.gap, settings.speck, smallest)
 
     def learn(self, frame: Frame, followed: list[Array]) -> None:
-        elapsed, self._t = max(frame.t - self._t, 0.0), frame.t
         lens = self._clip.camera.ground.lens
         if lens is not None:
             followed = [distort_points(outline, lens) for outline in followed if len(outline)]
-        self._background.learn(frame.image, elapsed / self._clip.config.background.memory_s, followed)
+        self._background.learn(frame.image, frame.t, followed)
 
 
 def _sampled(source: VideoSource, warmup_s: float) -> Iterator[Any]:

@@ -9,10 +9,13 @@ import cv2
 import numpy as np
 
 from visfuse_cli.records import Array, Image
+from visfuse_cli.vision.ghosts import find_ghosts
 
 FOREGROUND, SHADOW = 255, 127
 GROUPS = (0.9, 0.75, 0.6, 0.5, 0.4, 0.3)  # shares of a scene's pictures that may show the same
 ALIKE = 16  # grey levels between the least and the largest of the same
+NOISE = 3.0  # grey levels a channel, of what a picture and its background may differ by where a ghost was
+STILL_S = 1.0  # s that a ghost stands before it is looked for
 LEARN_EVERY = 4  # frames: learning costs as much as looking
 
 
@@ -23,7 +26,7 @@ class Background:
     that waits at a light does not dissolve into the road.
     """
 
-    def __init__(self, kind: str, threshold: float, shadow_ratio: float) -> None:
+    def __init__(self, kind: str, threshold: float, shadow_ratio: float, memory_s: float) -> None:
         model: Any
         if kind == "mog2":
             model = cv2.createBackgroundSubtractorMOG2(500, threshold, True)
@@ -32,9 +35,14 @@ class Background:
         model.setShadowValue(SHADOW)
         model.setShadowThreshold(shadow_ratio)
         self._model = model
+        self._farthest = 3 * threshold * NOISE**2
+        self._memory_s = memory_s
         self._waiting = 0  # frames since the last one that was learnt
-        self._share = 0.0
+        self._learnt_t = 0.0
         self._picture: Image | None = None
+        self._labels: Image | None = None
+        self._corrected: Image | None = None  # 255 where a ghost was taken out of the picture; the model learns slowly
+        self._compared: tuple[float, Image, Image] | None = None  # t, grey picture and labels when ghosts were sought
 
     def start(self, picture: Image) -> None:
         """Begin from a picture (H, W, 3) of the empty scene."""
@@ -43,15 +51,26 @@ class Background:
 
     def detect(self, image: Image) -> Image:
         """Label each pixel of `image` (H, W, 3): 255 foreground, 127 shadow, 0 background, without learning it."""
-        return np.asarray(self._model.apply(image, learningRate=0.0), dtype=np.uint8)
+        self._labels = np.asarray(self._model.apply(image, learningRate=0.0), dtype=np.uint8)
+        if self._corrected is not None:
+            u, v, w, h = cv2.boundingRect(self._corrected)
+            part = np.s_[v : v + h, u : u + w]
+            far = cv2.absdiff(image[part], self._picture[part]).astype(np.float32)
+            alike = np.einsum("uvc,uvc->uv", far, far) < self._farthest
+            self._labels[part][alike & (self._corrected[part] > 0)] = 0
+        return self._labels
 
-    def learn(self, image: Image, rate: float, followed: Iterable[Array]) -> None:
-        """Adapt to `image` by `rate` (share a frame) except inside the followed outlines (k, 2) px."""
+    def learn(self, image: Image, t: float, followed: Iterable[Array]) -> None:
+        """Adapt to `image` (H, W, 3) at t (s), the one looked at last, except inside the followed outlines (k, 2) px.
+
+        A thing that the background holds and that is no longer there is taken out of it at once.
+        """
         self._waiting += 1
-        self._share += rate
         if self._picture is None or self._waiting < LEARN_EVERY:
             return
-        rate, self._waiting, self._share = min(self._share, 1.0), 0, 0.0
+        rate = float(np.clip((t - self._learnt_t) / self._memory_s, 0, 1))
+        self._waiting, self._learnt_t = 0, t
+        self._forget_ghosts(image, t)
         hulls = [np.round(hull).astype(np.int32) for hull in followed]
         if hulls:
             mask = np.zeros(image.shape[:2], np.uint8)
@@ -61,6 +80,20 @@ class Background:
             cv2.copyTo(self._picture, mask, image)
         self._model.apply(image, learningRate=rate)
         self._picture = cv2.addWeighted(image, max(rate, 1 / 64), self._picture, 1 - max(rate, 1 / 64), 0)
+
+    def _forget_ghosts(self, image: Image, t: float) -> None:
+        if self._compared is not None and t - self._compared[0] < STILL_S:
+            return
+        assert self._labels is not None
+        grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+        if self._compared is not None:
+            _, earlier, labels = self._compared
+            moved = cv2.compare(cv2.bitwise_and(self._labels, labels), FOREGROUND, cv2.CMP_EQ)
+            gone = find_ghosts(grey, earlier, moved, cv2.cvtColor(self._picture, cv2.COLOR_BGR2GRAY))
+            if gone.any():
+                cv2.copyTo(image, gone, self._picture)
+                self._corrected = gone if self._corrected is None else cv2.bitwise_or(self._corrected, gone)
+        self._compared = t, grey, self._labels
 
 
 def empty_picture(images: Iterable[Image]) -> Image:
