@@ -225,9 +225,7 @@ class _MovingRegions:
         settings = clip.config.background
         self._clip = clip
         self._bands = region_tools.bands(clip.camera)
-        self._background = Background(
-            settings.model, settings.threshold, settings.shadow_ratio, settings.memory_s
-        )
+        self._background = Background(settings.model, settings.threshold, settings.shadow_ratio, settings.memory_s)
         with run_.stage("warm up"):
             self._background.start(empty_picture(_sampled(clip.source, settings.warmup_s)))
 

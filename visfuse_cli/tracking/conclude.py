@@ -21,6 +21,7 @@ from visfuse_cli.tracking.targets import Sample, Track
 from visfuse_cli.vision.wireframe import Outlines
 
 START_DOUBT = 5.0  # times the deviations a new track begins with
+SETTLING = 12  # measurements until that doubt is gone
 
 
 @dataclass(frozen=True, slots=True)
@@ -157,10 +158,12 @@ def _filter(
     belief = Gaussian(first.posterior.mean, first.posterior.cov * START_DOUBT**2)
     steps: list[Step] = []
     trusted = np.zeros(len(samples), dtype=bool)
+    count = 0
     for k, now in enumerate(measured):
         dt = np.array([samples[k].t - samples[k - 1].t if k else 0.0])
         expected = dynamics_tools.predict(dynamics, [belief], dt, np.array([length]))[0]
-        memory = steps[-1].memory if steps else None
+        # The record of residuals begins when the belief has settled: the first doubt is no sign of a manoeuvre.
+        memory = steps[-1].memory if count > SETTLING else None
         step = dynamics_tools.coast(expected, memory)
         if now is not None:
             z, R = now[0], now[1] * scale
@@ -169,6 +172,7 @@ def _filter(
             # Outside the gate a measurement counts less the further off it is: a bad start is left behind in the end.
             step = dynamics_tools.take(dynamics, expected, z, R * max(1.0, nis / gate) ** 2, memory)
             trusted[k] = nis < gate
+            count += 1
         steps.append(step)
         belief = step.posterior
     return steps, trusted

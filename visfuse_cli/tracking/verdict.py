@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from pydantic import Field
+from scipy.ndimage import maximum_filter1d
 
 from visfuse_cli.config import Section
 from visfuse_cli.maths.speed import way
@@ -15,6 +16,7 @@ from visfuse_cli.tracking.conclude import Path
 Z95 = 1.959964
 SIZE_DOUBT = 0.03  # of a size: no vehicle is quite a box
 GOOD_ENOUGH, LONGER_FOR = 0.01, 1.5  # standard deviation of a speed over itself
+JUMP_S = 0.3  # s a change of speed is looked at
 
 
 class SpeedSettings(Section):
@@ -77,6 +79,9 @@ def _best_stretch(
     i, j = (index.ravel() for index in np.meshgrid(grid, grid, indexing="ij"))
     duration, distance = path.t[j] - path.t[i], length[j] - length[i]
     allowed = (duration >= settings.min_duration_s) & (distance >= settings.min_distance_m)
+    jumped = np.cumsum(_jumps(path) > settings.max_acceleration)
+    whole = allowed & (jumped[i] == jumped[j])
+    allowed = whole if whole.any() else allowed
     if not allowed.any():
         allowed = (i == grid[0]) & (j == grid[-1])
     i, j, duration, distance = i[allowed], j[allowed], duration[allowed], distance[allowed]
@@ -105,7 +110,7 @@ def _reason(path: Path, verdict: Verdict, settings: SpeedSettings) -> str:
     """Why this track gets no speed; empty when it does. Nothing is clamped: a track is believed or rejected."""
     duration = path.t[verdict.last] - path.t[verdict.first]
     frames = int(path.measured[verdict.first : verdict.last + 1].sum())
-    excess = _jump(path, verdict)
+    excess = float(np.max(_jumps(path)[verdict.first : verdict.last + 1], initial=0.0))
     refused = path.refused / max(1, path.refused + int(path.measured.sum()))
     if path.ended_by.startswith("same vehicle"):
         return path.ended_by
@@ -131,17 +136,18 @@ def _reason(path: Path, verdict: Verdict, settings: SpeedSettings) -> str:
     return ""
 
 
-def _jump(path: Path, verdict: Verdict) -> float:
-    """The largest change of speed (m/s^2) over 0.3 s of the stretch that its uncertainty does not explain."""
-    stretch = slice(verdict.first, verdict.last + 1)
-    t, velocity = path.t[stretch], path.planar.mean[stretch, 2:]
-    speed = np.linalg.norm(velocity, axis=1)
-    sigma = np.sqrt(np.trace(path.planar.cov[stretch, 2:, 2:], axis1=1, axis2=2))
-    if len(t) < 3:
-        return 0.0
-    reach = max(1, round(0.3 / float(np.median(np.diff(t)))))
-    change = np.abs(speed[reach:] - speed[:-reach]) - 2 * (sigma[reach:] + sigma[:-reach])
-    return float(np.max(change / (t[reach:] - t[:-reach]), initial=0.0))
+def _jumps(path: Path) -> Array:
+    """Change of speed (T,) m/s^2 around each state, over JUMP_S, that its uncertainty does not explain."""
+    t = path.t
+    speed = np.linalg.norm(path.planar.mean[:, 2:], axis=1)
+    sigma = np.sqrt(np.trace(path.planar.cov[:, 2:, 2:], axis1=1, axis2=2))
+    excess = np.zeros(len(t))
+    reach = max(1, round(JUMP_S / float(np.median(np.diff(t))))) if len(t) > 2 else len(t)
+    if reach < len(t):
+        change = np.abs(speed[reach:] - speed[:-reach])
+        change = np.maximum(change - 2 * (sigma[reach:] + sigma[:-reach]), change / 2)  # no doubt explains everything
+        excess[reach // 2 : len(t) - reach + reach // 2] = change / (t[reach:] - t[:-reach])
+    return np.asarray(maximum_filter1d(excess, 3 * reach + 1))  # smoothing bends the path around a jump as well
 
 
 def _outline_px(path: Path) -> float:
