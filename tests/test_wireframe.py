@@ -2,27 +2,13 @@
 
 import numpy as np
 import pytest
+from masks import CAR, road_camera
 
-from visfuse_cli.maths.cameras import elevation, ground_camera, ground_scale, project
-from visfuse_cli.records import GroundMap
+from visfuse_cli.maths.cameras import elevation, ground_scale, project
 from visfuse_cli.vision import wireframe
 from visfuse_cli.vision.wireframe import DIRECTIONS, FAN, Outlines
 
 pytestmark = pytest.mark.geometry
-SIZE = (1280, 720)
-CAR = np.array([4.4, 1.8, 1.5])
-
-
-def road_camera(pitch=0.28, yaw=0.1, focal=1100.0, centre=(2.0, -3.0, 7.5)):
-    K = np.array([[focal, 0, 639.5], [0, focal, 359.5], [0, 0, 1.0]])
-    forward = np.array([np.sin(yaw) * np.cos(pitch), np.cos(yaw) * np.cos(pitch), -np.sin(pitch)])
-    right = np.array([np.cos(yaw), -np.sin(yaw), 0])
-    R = np.stack([right, np.cross(forward, right), forward])
-    P = K @ np.column_stack([R, -R @ np.array(centre)])
-    H = np.linalg.inv(P[:, [0, 1, 3]])
-    H /= H[2, 2]
-    sign = int(np.sign(H[2] @ [640, 500, 1]))
-    return ground_camera(GroundMap(H, 1e-16 * np.eye(9), sign, "pixel", SIZE, None, 0.0, 0.0), SIZE)
 
 
 def passing_cars(n=40):

@@ -182,15 +182,16 @@ class Nursery:
         life = self._settings.life
         if len(candidate.anchors) < life.confirm_frames or candidate.anchors[-1][3] > life.birth_scale:
             return None
-        a = np.array(candidate.anchors[-COURSE_FRAMES:])
-        t = a[:, 0] - a[:, 0].mean()
-        velocity = t @ (a[:, 1:3] - a[:, 1:3].mean(axis=0)) / max(t @ t, 1e-12)
-        way = velocity * (a[-1, 0] - a[0, 0])
-        stray = a[:, 1:3] - a[:, 1:3].mean(axis=0) - t[:, None] * velocity
-        noise = max(float(np.sqrt(np.mean(stray**2))), 2 * a[:, 3].mean() / np.sqrt(len(a)))
-        if np.hypot(*way) < max(life.confirm_m, 4 * noise):
-            return None
-        return np.asarray(velocity)
+        for frames in (COURSE_FRAMES, len(candidate.anchors)):  # what creeps needs longer
+            a = np.array(candidate.anchors[-frames:])
+            t = a[:, 0] - a[:, 0].mean()
+            velocity = t @ (a[:, 1:3] - a[:, 1:3].mean(axis=0)) / max(t @ t, 1e-12)
+            way = velocity * (a[-1, 0] - a[0, 0])
+            stray = a[:, 1:3] - a[:, 1:3].mean(axis=0) - t[:, None] * velocity
+            noise = max(float(np.sqrt(np.mean(stray**2))), 2 * a[:, 3].mean() / np.sqrt(len(a)))
+            if np.hypot(*way) > max(life.confirm_m, 4 * noise):
+                return np.asarray(velocity)
+        return None
 
     def _replay(
         self, samples: list[Sample], fit: wireframe.BoxFit, pose: Array, velocity: Array, size: Array

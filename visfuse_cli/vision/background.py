@@ -16,6 +16,7 @@ GROUPS = (0.9, 0.75, 0.6, 0.5, 0.4, 0.3)  # shares of a scene's pictures that ma
 ALIKE = 16  # grey levels between the least and the largest of the same
 NOISE = 3.0  # grey levels a channel, of what a picture and its background may differ by where a ghost was
 STILL_S = 1.0  # s that a ghost stands before it is looked for
+KNN_FIRST, KNN_LOOKING = (0.5,) * 10, 1e-9  # rates: it fills its samples one by one, and divides by the logarithm
 LEARN_EVERY = 4  # frames: learning costs as much as looking
 
 
@@ -29,9 +30,10 @@ class Background:
     def __init__(self, kind: str, threshold: float, shadow_ratio: float, memory_s: float) -> None:
         model: Any
         if kind == "mog2":
-            model = cv2.createBackgroundSubtractorMOG2(500, threshold, True)
+            model, self._first = cv2.createBackgroundSubtractorMOG2(500, threshold, True), (1.0,)
         else:
-            model = cv2.createBackgroundSubtractorKNN(500, threshold * 25, True)
+            model, self._first = cv2.createBackgroundSubtractorKNN(500, threshold * 25, True), KNN_FIRST
+        self._looking = 0.0 if kind == "mog2" else KNN_LOOKING
         model.setShadowValue(SHADOW)
         model.setShadowThreshold(shadow_ratio)
         self._model = model
@@ -46,12 +48,13 @@ class Background:
 
     def start(self, picture: Image) -> None:
         """Begin from a picture (H, W, 3) of the empty scene."""
-        self._model.apply(picture, learningRate=1.0)
-        self._picture = picture.copy()
+        for rate in self._first:
+            self._model.apply(picture, learningRate=rate)
+        self._picture, self._corrected, self._compared = picture.copy(), None, None
 
     def detect(self, image: Image) -> Image:
         """Label each pixel of `image` (H, W, 3): 255 foreground, 127 shadow, 0 background, without learning it."""
-        self._labels = np.asarray(self._model.apply(image, learningRate=0.0), dtype=np.uint8)
+        self._labels = np.asarray(self._model.apply(image, learningRate=self._looking), dtype=np.uint8)
         if self._corrected is not None:
             u, v, w, h = cv2.boundingRect(self._corrected)
             part = np.s_[v : v + h, u : u + w]

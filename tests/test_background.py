@@ -1,0 +1,106 @@
+"""The adaptive background: the empty picture, shadows, what is followed, and ghosts."""
+
+import cv2
+import numpy as np
+import pytest
+
+from visfuse_cli.vision.background import FOREGROUND, SHADOW, STILL_S, Background, empty_picture
+from visfuse_cli.vision.ghosts import find_ghosts
+
+HIGH, WIDE = 120, 160
+
+
+def road(seed=0):
+    rng = np.random.default_rng(seed)
+    coarse = rng.integers(95, 135, (12, 16, 1)).astype(np.uint8)
+    return np.repeat(cv2.resize(coarse, (WIDE, HIGH), interpolation=cv2.INTER_CUBIC)[..., None], 3, axis=2)
+
+
+def noisy(picture, rng, sigma=2.0):
+    return np.clip(picture + rng.normal(0, sigma, picture.shape), 0, 255).round().astype(np.uint8)
+
+
+def with_car(picture, left, colour=(40, 40, 200), top=50, size=(40, 30), window=True):
+    picture = picture.copy()
+    cv2.rectangle(picture, (left, top), (left + size[0] - 1, top + size[1] - 1), colour, -1)
+    if window:
+        cv2.rectangle(picture, (left + 6, top + 4), (left + size[0] - 8, top + 12), (30, 30, 30), -1)
+    return picture
+
+
+@pytest.fixture(params=["mog2", "knn"])
+def background(request):
+    model = Background(request.param, 16.0, 0.45, 60.0)
+    model.start(road())
+    return model
+
+
+@pytest.mark.parametrize("covered", [0.3, 0.6])
+def test_the_road_is_found_under_traffic_that_covers_it_mostly(covered):
+    rng = np.random.default_rng(3)
+    pictures = []
+    for _ in range(40):
+        picture = noisy(road(), rng)
+        if rng.uniform() < covered:
+            colour = tuple(int(c) for c in rng.integers(0, 255, 3))
+            picture = with_car(picture, 30, colour, size=(60, 40), window=False)
+        pictures.append(picture)
+    found = empty_picture(pictures)
+    assert np.abs(found.astype(int) - road()).max() <= 8
+
+
+def test_one_picture_is_its_own_background():
+    np.testing.assert_array_equal(empty_picture([road()]), road())
+
+
+def test_a_car_is_foreground_and_a_darker_road_is_shadow(background):
+    picture = with_car(road(), 20)
+    picture[90:110, 100:150] = (picture[90:110, 100:150] * 0.65).astype(np.uint8)
+    labels = background.detect(noisy(picture, np.random.default_rng(1)))
+    assert (labels[52:78, 22:58] == FOREGROUND).mean() > 0.9
+    assert (labels[92:108, 102:148] == SHADOW).mean() > 0.8
+    assert (labels[:40] == 0).mean() > 0.97
+
+
+def test_looking_changes_nothing(background):
+    picture = with_car(road(), 20)
+    first = background.detect(picture).copy()
+    for _ in range(50):
+        last = background.detect(picture)
+    np.testing.assert_array_equal(first, last)
+
+
+@pytest.mark.parametrize("followed", [True, False])
+def test_what_is_followed_never_dissolves(followed):
+    rng = np.random.default_rng(5)
+    background = Background("mog2", 16.0, 0.45, 60.0)
+    background.start(road())
+    outline = np.array([[16.0, 46], [64, 46], [64, 84], [16, 84]])
+    for k in range(600):
+        picture = noisy(with_car(road(), 20), rng)
+        labels = background.detect(picture)
+        background.learn(picture, k / 10, [outline] if followed else [])
+    still_there = (labels[52:78, 22:58] == FOREGROUND).mean()
+    assert (still_there > 0.9) if followed else (still_there < 0.2)
+
+
+def test_a_thing_that_has_gone_leaves_no_ghost_and_a_thing_that_stands_stays(background):
+    rng = np.random.default_rng(2)
+    background.start(with_car(road(), 100))  # stood there while the scene was learnt
+    labels = np.zeros(0)
+    for k in range(int(25 * (STILL_S + 1))):
+        picture = noisy(with_car(road(), 20), rng)  # another has come to stand elsewhere
+        labels = background.detect(picture)
+        background.learn(picture, k / 25, [])
+    assert (labels[52:78, 102:138] == FOREGROUND).mean() < 0.05
+    assert (labels[52:78, 22:58] == FOREGROUND).mean() > 0.9
+
+
+def test_ghosts_need_contrast_in_the_background_alone():
+    grey = cv2.cvtColor(road(), cv2.COLOR_BGR2GRAY)
+    car = cv2.cvtColor(with_car(road(), 60), cv2.COLOR_BGR2GRAY)
+    moved = cv2.compare(cv2.absdiff(grey, car), 10, cv2.CMP_GT)
+    assert find_ghosts(grey, grey, moved, car)[65, 80] == 255
+    assert not find_ghosts(car, car, moved, grey).any()
+    assert not find_ghosts(grey, car, moved, car).any()  # it has only just gone
+    assert not find_ghosts(grey, grey, np.zeros_like(grey), grey).any()

@@ -1,0 +1,172 @@
+"""The tracker on exact label pictures: births, look-back, hiding, joining, detections, ends."""
+
+import numpy as np
+import pytest
+from masks import CAR, SIZE, TRUCK, drive, evidence_of, labels_of, road_camera
+
+from visfuse_cli.maths.angles import wrap
+from visfuse_cli.tracking import hypotheses
+from visfuse_cli.tracking.conclude import conclude
+from visfuse_cli.tracking.evidence import BoxEvidence
+from visfuse_cli.tracking.ground import GroundTracker
+from visfuse_cli.tracking.settings import PERSON, LifeSettings, TargetSettings, TrackerSettings
+from visfuse_cli.vision import regions, wireframe
+
+CAMERA = road_camera()
+NOBODY = np.zeros((0, 3)), np.zeros((0, 3))
+FPS = 25.0
+
+
+def follow(frames, settings=None, evidence=evidence_of):
+    """Everything that ended, of frames (lists of boxes) seen one by one."""
+    tracker = GroundTracker(CAMERA, settings or TrackerSettings())
+    tracks, abandoned = [], []
+    for k, boxes in enumerate(frames):
+        tracker.predict(k / FPS)
+        ended = tracker.update(k, evidence(CAMERA, labels_of(CAMERA, boxes)))
+        tracks += ended[0]
+        abandoned += ended[1]
+    ended = tracker.finish()
+    return tracker, tracks + ended[0], abandoned + ended[1]
+
+
+def poses(track, tracker):
+    x = np.stack([step.posterior.mean for step in track.steps])
+    return np.column_stack([x[:, :2], tracker.dynamics.heading(x)])
+
+
+def error(track, tracker, truth):
+    """Distance (n,) m from the truth's poses (frames, 3), and heading error (n,) rad."""
+    at = np.array([sample.frame for sample in track.samples])
+    mine = poses(track, tracker)
+    return np.linalg.norm(mine[:, :2] - truth[at, :2], axis=1), np.abs(wrap(mine[:, 2] - truth[at, 2]))
+
+
+def region_of(boxes):
+    (region,) = evidence_of(CAMERA, labels_of(CAMERA, boxes)).leftovers(*NOBODY)
+    return region
+
+
+@pytest.mark.parametrize(("name", "size"), [("car", CAR), ("truck", TRUCK), ("two-wheeler", np.array([2.0, 0.8, 1.6]))])
+def test_a_region_is_taken_for_the_class_that_it_is(name, size):
+    pose = np.array([2.0, 24.0, 1.4])
+    evidence = evidence_of(CAMERA, labels_of(CAMERA, [(pose, size)]))
+    guess = hypotheses.best_guess(CAMERA, TrackerSettings(), evidence, region_of([(pose, size)]), 1.4, NOBODY)
+    assert guess is not None
+    assert guess.prior.name == name
+    np.testing.assert_allclose(guess.pose[:2], pose[:2], atol=0.5)
+    np.testing.assert_allclose(guess.size, size, rtol=0.2)
+    assert guess.gain <= hypotheses.gain_of(CAMERA, evidence, guess.pose, guess.size, NOBODY)
+    assert guess.gain > hypotheses.gain_of(CAMERA, evidence, guess.pose + [1.0, 3.0, 0.0], guess.size, NOBODY)
+
+
+def test_a_shadow_alone_is_taken_for_nothing():
+    pose = np.array([2.0, 24.0, 1.4])
+    evidence = evidence_of(CAMERA, labels_of(CAMERA, [], [(pose, CAR)]))
+    region = region_of([(pose, CAR)])
+    assert hypotheses.best_guess(CAMERA, TrackerSettings(), evidence, region, 1.4, NOBODY) is None
+
+
+def test_a_car_is_one_track_from_where_it_was_first_seen():
+    t = np.arange(50) / FPS
+    truth = drive([1.0, 16.0], [-1.5, 12.0], t)
+    tracker, tracks, _ = follow([[(pose, CAR)] for pose in truth])
+    (track,) = tracks
+    assert (track.samples[0].frame, track.samples[-1].frame) == (0, 49)
+    assert track.prior_class.name == "car"
+    distance, turned = error(track, tracker, truth)
+    assert np.median(distance) < 0.25
+    assert np.median(turned) < 0.05
+    path = conclude(track, CAMERA, tracker.settings, tracker.dynamics)
+    speed = np.linalg.norm(path.planar.mean[10:-10, 2:], axis=1)
+    np.testing.assert_allclose(speed, np.hypot(1.5, 12.0), rtol=0.03)
+
+
+def test_a_car_behind_a_truck_keeps_its_number():
+    t = np.arange(75) / FPS
+    behind, front = drive([-4.0, 27.0], [4.0, 4.0], t), drive([15.0, 18.0], [-9.0, 0.3], t)
+    tracker, tracks, _ = follow([[(a, CAR), (b, TRUCK)] for a, b in zip(behind, front, strict=True)])
+    cars = [track for track in tracks if np.median(error(track, tracker, behind)[0]) < 1.0 and len(track.samples) > 10]
+    (car,) = cars
+    assert car.samples[-1].frame - car.samples[0].frame > 60
+    assert error(car, tracker, behind)[0][-1] < 1.5
+
+
+def test_two_that_touch_are_two():
+    t = np.arange(40) / FPS
+    left, right = drive([0.0, 18.0], [0.0, 11.0], t), drive([2.6, 20.0], [0.0, 10.0], t)
+    tracker, tracks, _ = follow([[(a, CAR), (b, CAR)] for a, b in zip(left, right, strict=True)])
+    assert len(tracks) == 2
+    for truth in (left, right):
+        assert min(np.median(error(track, tracker, truth)[0]) for track in tracks) < 0.5
+
+
+def test_a_car_that_stops_stays_where_it_is():
+    t = np.arange(130) / FPS
+    way = np.where(t < 2, 10 * t - 2.5 * t**2, 10.0)  # brakes at 5 m/s^2
+    truth = drive([1.0, 16.0], [0.0, 1.0], way)
+    tracker, tracks, _ = follow([[(pose, CAR)] for pose in truth])
+    (track,) = tracks
+    assert track.samples[-1].frame == len(truth) - 1
+    assert error(track, tracker, truth)[0][-50:].max() < 0.5
+    assert abs(track.steps[-1].posterior.mean[2]) < 0.3
+
+
+def test_what_never_moves_is_given_up_with_its_place():
+    pose = np.array([2.0, 24.0, 1.4])
+    _, tracks, abandoned = follow([[(pose, CAR)]] * 170)
+    assert tracks == []
+    given_up = abandoned[0]
+    assert given_up.reason == "did not move"
+    assert np.linalg.norm(given_up.position - pose[:2]) < 3
+
+
+def test_what_creeps_is_found():
+    t = np.arange(80) / FPS
+    truth = drive([1.0, 16.0], [0.1, 1.2], t)
+    tracker, tracks, _ = follow([[(pose, CAR)] for pose in truth])
+    (track,) = tracks
+    assert np.median(error(track, tracker, truth)[0]) < 0.3
+
+
+def test_an_empty_road_has_no_tracks():
+    assert follow([[]] * 5)[1:] == ([], [])
+
+
+def test_people_walk_by_the_same_machinery():
+    t = np.arange(60) / FPS
+    size = np.array([0.5, 0.5, 1.72])
+    truth = drive([0.5, 14.0], [1.4, 0.2], t)
+    target = TargetSettings(motion="constant-velocity", classes=PERSON)
+    settings = TrackerSettings(target=target, life=LifeSettings(confirm_m=0.6))
+    tracker, tracks, _ = follow([[(pose, size)] for pose in truth], settings)
+    (track,) = tracks
+    assert np.median(error(track, tracker, truth)[0]) < 0.2
+
+
+def test_detections_from_outside_are_tracked_alike():
+    t = np.arange(50) / FPS
+    truth = drive([1.0, 16.0], [-1.5, 12.0], t)
+
+    def boxes(camera, labels):
+        v, u = np.nonzero(labels)
+        box = np.array([u.min() - 0.5, v.min() - 0.5, np.ptp(u) + 1, np.ptp(v) + 1])
+        return BoxEvidence([regions.from_box(box, 1.0, SIZE)], camera)
+
+    tracker, tracks, _ = follow([[(pose, CAR)] for pose in truth], evidence=boxes)
+    (track,) = tracks
+    assert len(track.samples) > 40
+    assert np.median(error(track, tracker, truth)[0]) < 0.7
+
+
+def test_silhouettes_of_the_live_tracks_are_their_outlines():
+    t = np.arange(30) / FPS
+    truth = drive([1.0, 16.0], [0.0, 10.0], t)
+    tracker = GroundTracker(CAMERA, TrackerSettings())
+    for k, pose in enumerate(truth):
+        tracker.predict(k / FPS)
+        tracker.update(k, evidence_of(CAMERA, labels_of(CAMERA, [(pose, CAR)])))
+    (outline,) = tracker.outlines()
+    true = wireframe.silhouette(CAMERA, truth[-1], CAR)
+    np.testing.assert_allclose(outline.min(axis=0), true.min(axis=0), atol=8)
+    np.testing.assert_allclose(outline.max(axis=0), true.max(axis=0), atol=8)
