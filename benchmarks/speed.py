@@ -104,11 +104,11 @@ def main() -> None:
                 model.apply(frame)
 
         def background_ours() -> None:
-            model = Background("mog2", 16.0, 0.45)
+            model = Background("mog2", 16.0, 0.45, 60.0)
             model.start(frames[0])
-            for frame in frames:
+            for number, frame in enumerate(frames):
                 model.detect(frame)
-                model.learn(frame, 0.001, [])
+                model.learn(frame, number / 25, [])
 
         def write_mp4v() -> None:
             writer = cv2.VideoWriter(

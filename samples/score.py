@@ -15,8 +15,8 @@ def rows(path: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
-def matches(run: Path, truth: Path) -> list[tuple[dict[str, str], float, float, int | None]]:
-    """For each row: itself, the true mean speed over its own stretch, the share of time within 2 m, the vehicle."""
+def matches(run: Path, truth: Path, reach_m: float = 2.0) -> list[tuple[dict[str, str], float, float, int | None]]:
+    """For each row: itself, the true mean speed over its own stretch, the share of time within reach, the vehicle."""
     tracks = {track["id"]: track for track in json.loads((run / "tracks.json").read_text())["tracks"]}
     true: dict[int, list[list[float]]] = {}
     for row in rows(truth):
@@ -30,7 +30,7 @@ def matches(run: Path, truth: Path) -> list[tuple[dict[str, str], float, float, 
         for vehicle, values in true.items():
             v = np.array(values)
             at = [np.interp(v[:, 0], t, xy[:, k], left=np.nan, right=np.nan) for k in (0, 1)]
-            share = float(np.mean(np.hypot(at[0] - v[:, 1], at[1] - v[:, 2]) < 2))
+            share = float(np.mean(np.hypot(at[0] - v[:, 1], at[1] - v[:, 2]) < reach_m))
             if share > best[0]:
                 inside = (v[:, 0] >= float(row["t_start"]) - 1e-6) & (v[:, 0] <= float(row["t_end"]) + 1e-6)
                 best = (share, vehicle, float(np.hypot(v[inside, 3], v[inside, 4]).mean() * 3.6))

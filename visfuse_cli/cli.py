@@ -63,9 +63,7 @@ def _main(
         bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")
     ] = False,
     quiet: QuietOption = False,
-    verbose: Annotated[
-        bool, typer.Option("-v", "--verbose", help="Print warnings in full and times per stage.")
-    ] = False,
+    verbose: Annotated[bool, typer.Option("-v", "--verbose", help="Print the time that each stage took.")] = False,
 ) -> None:
     global _quiet, _verbose
     _quiet, _verbose = quiet, verbose
@@ -256,6 +254,9 @@ def _report(result: RunResult, as_json: bool, quiet: bool, text: Any) -> None:
     if not quiet:
         for warning in result.warnings:
             typer.echo(f"visfuse: warning: {warning}", err=True)
+    if _verbose:
+        for stage, seconds in result.stages.items():
+            typer.echo(f"visfuse: {stage}: {seconds:.2f} s", err=True)
     if as_json:
         typer.echo(json.dumps(result.summary, allow_nan=False))
     elif not quiet:

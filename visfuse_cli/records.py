@@ -137,6 +137,7 @@ class RunResult:
     summary: dict[str, Any]
     warnings: tuple[str, ...] = ()
     stopped_by: int | None = None  # signal number
+    stages: dict[str, float] = field(default_factory=dict)  # s spent in each
 
 
 @dataclass(frozen=True, slots=True)

@@ -25,46 +25,24 @@ from visfuse_cli.files.video import VideoSource, describe, is_clip_folder, list_
 from visfuse_cli.files.video_writer import VideoWriter
 from visfuse_cli.maths.cameras import ground_camera
 from visfuse_cli.pipeline import Run
-from visfuse_cli.records import Array, Frame, GroundCamera, GroundMap, RunRequest, RunResult, TimeAudit
+from visfuse_cli.records import Array, GroundCamera, GroundMap, RunRequest, RunResult, TimeAudit
 from visfuse_cli.tracking.annotate import UNITS, annotate
 from visfuse_cli.tracking.conclude import conclude
-from visfuse_cli.tracking.evidence import BoxEvidence, Evidence, LabelEvidence
+from visfuse_cli.tracking.foreground import BackgroundSettings, Detections, Detector, MovingRegions, RegionSettings
 from visfuse_cli.tracking.ground import GroundTracker
-from visfuse_cli.tracking.output import COLUMNS, abandoned_row, lane_of, row_of, track_record
+from visfuse_cli.tracking.output import COLUMNS, Polygon, abandoned_row, lane_of, row_of, track_record
 from visfuse_cli.tracking.settings import TrackerSettings
 from visfuse_cli.tracking.targets import Abandoned, Track
 from visfuse_cli.tracking.verdict import SpeedSettings, judge
-from visfuse_cli.vision import regions as region_tools
-from visfuse_cli.vision.background import Background, empty_picture
-from visfuse_cli.vision.lens import distort_points
 
 WARMUP_PICTURES = 31
 SEEN_FRAMES = 8  # a region seen for fewer frames than this is noise and not worth a line in the ledger
-
-Polygon = tuple[tuple[float, float], ...]
 
 
 class VideoSettings(Section):
     """Where times come from when the footage carries none."""
 
     fps: float | None = Field(None, gt=0, le=10000, description="frames/s of an image folder without timestamps.csv")
-
-
-class BackgroundSettings(Section):
-    """The adaptive background."""
-
-    model: Literal["mog2", "knn"] = Field("mog2", description="mog2: mixture of Gaussians; knn: nearest neighbours")
-    threshold: float = Field(16.0, gt=0, le=1000, description="squared distance (variances) of a foreground pixel")
-    memory_s: float = Field(60.0, gt=0, le=36000, description="s: how long the background remembers")
-    shadow_ratio: float = Field(0.45, gt=0, lt=1, description="darkest a shadow may be, as a share of the lit ground")
-    warmup_s: float = Field(20.0, ge=0, le=600, description="s: the empty scene is found in this much footage")
-
-
-class RegionSettings(Section):
-    """Cleaning of the foreground, in metres at the scale of the ground."""
-
-    gap: float = Field(0.3, ge=0, le=5, description="m: gaps up to this size are closed")
-    speck: float = Field(0.12, ge=0, le=5, description="m: specks below this size are removed")
 
 
 class DisplaySettings(Section):
@@ -164,7 +142,7 @@ def run(request: RunRequest) -> RunResult:
             stopped_by=run_.stopped_by,
             extra={"summary": summary, "annotated_by": "a second decode of the footage" if request.video else None},
         )
-    return RunResult(request.out, summary, run_.warnings, run_.stopped_by)
+    return RunResult(request.out, summary, run_.warnings, run_.stopped_by, run_.stages)
 
 
 def _ground_map(path: Path) -> GroundMap:
@@ -199,7 +177,7 @@ def _track(clip: _Clip, run_: Run, spool: TrackSpool, results: _Results, first_i
     """Follow everything in one clip; returns the next free id."""
     tracker = GroundTracker(clip.camera, clip.config, first_id)
     results.drawn[clip.name] = []
-    look = _Detections(clip) if clip.boxes is not None else _MovingRegions(clip, run_)
+    look = _detector(clip, run_)
     for frame in run_.frames(clip.source):
         with run_.stage("detect"):
             evidence = look.evidence(frame)
@@ -218,27 +196,13 @@ def _track(clip: _Clip, run_: Run, spool: TrackSpool, results: _Results, first_i
     return tracker.next_id
 
 
-class _MovingRegions:
-    """Regions that differ from the adaptive background."""
-
-    def __init__(self, clip: _Clip, run_: Run) -> None:
-        settings = clip.config.background
-        self._clip = clip
-        self._bands = region_tools.bands(clip.camera)
-        self._background = Background(settings.model, settings.threshold, settings.shadow_ratio, settings.memory_s)
-        with run_.stage("warm up"):
-            self._background.start(empty_picture(_sampled(clip.source, settings.warmup_s)))
-
-    def evidence(self, frame: Frame) -> Evidence:
-        labels = self._background.detect(frame.image)
-        settings, smallest = self._clip.config.regions, self._clip.config.target.smallest
-        return LabelEvidence(labels, self._clip.camera, self._bands, settings.gap, settings.speck, smallest)
-
-    def learn(self, frame: Frame, followed: list[Array]) -> None:
-        lens = self._clip.camera.ground.lens
-        if lens is not None:
-            followed = [distort_points(outline, lens) for outline in followed if len(outline)]
-        self._background.learn(frame.image, frame.t, followed)
+def _detector(clip: _Clip, run_: Run) -> Detector:
+    if clip.boxes is not None:
+        return Detections(clip.camera, clip.boxes)
+    config = clip.config
+    with run_.stage("warm up"):
+        pictures = _sampled(clip.source, config.background.warmup_s)
+        return MovingRegions(clip.camera, config.background, config.regions, config.target.smallest, pictures)
 
 
 def _sampled(source: VideoSource, warmup_s: float) -> Iterator[Any]:
@@ -254,25 +218,6 @@ def _sampled(source: VideoSource, warmup_s: float) -> Iterator[Any]:
             return
         if number % step == 0:
             yield frame.image
-
-
-class _Detections:
-    """Regions from external boxes."""
-
-    def __init__(self, clip: _Clip) -> None:
-        self._boxes = clip.boxes or {}
-        self._camera = clip.camera
-        self._lens = clip.camera.ground.lens
-
-    def evidence(self, frame: Frame) -> Evidence:
-        rows = self._boxes.get(frame.index, np.zeros((0, 5)))
-        found = [region_tools.from_box(row[:4], row[4], self._camera.image_size) for row in rows]
-        if self._lens is not None:
-            found = [region_tools.undistorted(region, self._lens) for region in found]
-        return BoxEvidence(found, self._camera)
-
-    def learn(self, frame: Frame, followed: list[Array]) -> None:
-        """Boxes from outside need no background."""
 
 
 def _settle(
@@ -292,8 +237,7 @@ def _settle(
         verdict = judge(path, clip.camera.ground.cov, config.pose.bias_px, config.speed)
         spool.add(track_record(path, verdict, clip.camera, label))
         results.drawn[clip.name].append((int(path.frame[0]), path.id))
-        lanes = [np.array(polygon) for polygon in config.lanes]
-        lane = lane_of(path.planar.mean[(verdict.first + verdict.last) // 2, :2], lanes)
+        lane = lane_of(path.planar.mean[(verdict.first + verdict.last) // 2, :2], config.lanes)
         row = row_of(path, verdict, clip.name, _utc(begun, path.t[verdict.first]), lane)
         if verdict.reason:
             results.rejected.append(row)

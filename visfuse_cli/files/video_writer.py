@@ -35,7 +35,6 @@ class VideoWriter:
         self.size = (height, width)
         self._rate = Fraction(rate).limit_denominator(1001)
         self._last = -1
-        self._first_t = 0.0
         self._closing = ExitStack()
 
     def __enter__(self) -> VideoWriter:

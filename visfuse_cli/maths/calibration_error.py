@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from visfuse_cli.maths.homography import apply, depth, entry_jacobian, invert, jacobian
+from visfuse_cli.maths.speed import KMH
 from visfuse_cli.records import Array, GroundMap
 
 SPEED_KMH, DURATION_S = 50.0, 1.0
@@ -17,7 +18,7 @@ def speed_error(ground: GroundMap, pixels: Array, sigma_px: float) -> Array:
     the worst of four directions counts. The way slides along its direction to stay in the picture. NaN above the
     horizon.
     """
-    H, way = ground.ground_from_image, SPEED_KMH / 3.6 * DURATION_S
+    H, way = ground.ground_from_image, SPEED_KMH / KMH * DURATION_S
     out = np.full(len(pixels), np.nan)
     seen = depth(H, pixels) * ground.ground_sign > 1e-9
     middle: Array = apply(H, pixels[seen])
@@ -30,7 +31,7 @@ def speed_error(ground: GroundMap, pixels: Array, sigma_px: float) -> Array:
             begin = np.where(slack > 0, np.clip(-way / 2, first, last - way), first + slack / 2)
             ends = [middle + share[:, None] * along for share in (begin, begin + way)]
             worst = np.fmax(worst, _way_error(ground, ends[0], ends[1], along, sigma_px))
-    out[seen] = worst / DURATION_S * 3.6
+    out[seen] = worst / DURATION_S * KMH
     return out
 
 

@@ -7,6 +7,7 @@ import numpy as np
 from visfuse_cli.errors import InputError
 from visfuse_cli.records import Array
 
+KMH = 3.6  # km/h in 1 m/s
 SAME_COURSE = 0.5  # least length of the sum of two unit tangents (a turn of 151 degrees) that still has a direction
 
 

@@ -8,13 +8,14 @@ from typing import Any
 import numpy as np
 
 from visfuse_cli.maths.cameras import project
+from visfuse_cli.maths.speed import KMH
 from visfuse_cli.records import Array, Frame, GroundCamera, Image
 from visfuse_cli.tracking.output import box_corners
 from visfuse_cli.vision import drawing
 from visfuse_cli.vision.lens import distort_points
 
 TRAIL_S = 2.0
-UNITS = {"km/h": 3.6, "mph": 2.2369362920544, "m/s": 1.0}
+UNITS = {"km/h": KMH, "mph": 2.2369362920544, "m/s": 1.0}
 
 
 class _Drawn:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from visfuse_cli.maths.cameras import project
+from visfuse_cli.maths.speed import KMH
 from visfuse_cli.records import Array, GroundCamera
 from visfuse_cli.tracking.conclude import Path
 from visfuse_cli.tracking.targets import Abandoned
@@ -14,7 +16,7 @@ from visfuse_cli.tracking.verdict import Z95, Verdict
 from visfuse_cli.vision import wireframe
 from visfuse_cli.vision.lens import distort_points
 
-KMH = 3.6
+Polygon = tuple[tuple[float, float], ...]  # corners on the ground, m
 COLUMNS = (
     "clip",
     "track_id",
@@ -122,10 +124,10 @@ def abandoned_row(abandoned: Abandoned, clip: str, time_utc: str) -> dict[str, A
     }
 
 
-def lane_of(position: Array, lanes: list[Array]) -> int | None:
+def lane_of(position: Array, lanes: Sequence[Polygon]) -> int | None:
     """The number (from 1) of the first lane polygon (k, 2) m that holds a ground point (2,), or None."""
     for number, polygon in enumerate(lanes, start=1):
-        x, y = polygon[:, 0], polygon[:, 1]
+        x, y = np.transpose(polygon)
         x2, y2 = np.roll(x, -1), np.roll(y, -1)
         crosses = (y > position[1]) != (y2 > position[1])
         with np.errstate(divide="ignore", invalid="ignore"):

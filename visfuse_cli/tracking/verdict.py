@@ -9,7 +9,7 @@ from pydantic import Field
 from scipy.ndimage import maximum_filter1d
 
 from visfuse_cli.config import Section
-from visfuse_cli.maths.speed import way
+from visfuse_cli.maths.speed import KMH, way
 from visfuse_cli.records import Array
 from visfuse_cli.tracking.conclude import Path
 
@@ -131,8 +131,8 @@ def _reason(path: Path, verdict: Verdict, settings: SpeedSettings) -> str:
     if np.isfinite(path.misfit_px) and path.misfit_px > settings.max_misfit * outline + 3:
         return f"no box fits: outline off by {path.misfit_px:.0f} px (several vehicles, a shadow or a reflection)"
     if verdict.sigma > settings.max_sigma * abs(verdict.speed):
-        half = verdict.sigma * Z95 * 3.6
-        return f"too uncertain: {verdict.speed * 3.6:.0f} +- {half:.0f} km/h, outside the trusted zone"
+        half = verdict.sigma * Z95 * KMH
+        return f"too uncertain: {verdict.speed * KMH:.0f} +- {half:.0f} km/h, outside the trusted zone"
     return ""
 
 

@@ -29,6 +29,7 @@ class Background:
 
     def __init__(self, kind: str, threshold: float, shadow_ratio: float, memory_s: float) -> None:
         model: Any
+        self._first: tuple[float, ...]  # rates at which the first picture is learnt
         if kind == "mog2":
             model, self._first = cv2.createBackgroundSubtractorMOG2(500, threshold, True), (1.0,)
         else:
@@ -55,7 +56,7 @@ class Background:
     def detect(self, image: Image) -> Image:
         """Label each pixel of `image` (H, W, 3): 255 foreground, 127 shadow, 0 background, without learning it."""
         self._labels = np.asarray(self._model.apply(image, learningRate=self._looking), dtype=np.uint8)
-        if self._corrected is not None:
+        if self._corrected is not None and self._picture is not None:
             u, v, w, h = cv2.boundingRect(self._corrected)
             part = np.s_[v : v + h, u : u + w]
             far = cv2.absdiff(image[part], self._picture[part]).astype(np.float32)

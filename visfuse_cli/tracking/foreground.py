@@ -1,0 +1,90 @@
+"""What each frame says to the tracker: where it differs from the adaptive background, or boxes from outside."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Literal, Protocol
+
+import numpy as np
+from pydantic import Field
+
+from visfuse_cli.config import Section
+from visfuse_cli.records import Array, Frame, GroundCamera, Image
+from visfuse_cli.tracking.evidence import BoxEvidence, Evidence, LabelEvidence
+from visfuse_cli.vision import regions as region_tools
+from visfuse_cli.vision.background import Background, empty_picture
+from visfuse_cli.vision.lens import distort_points
+
+
+class BackgroundSettings(Section):
+    """The adaptive background."""
+
+    model: Literal["mog2", "knn"] = Field("mog2", description="mog2: mixture of Gaussians; knn: nearest neighbours")
+    threshold: float = Field(16.0, gt=0, le=1000, description="squared distance (variances) of a foreground pixel")
+    memory_s: float = Field(60.0, gt=0, le=36000, description="s: how long the background remembers")
+    shadow_ratio: float = Field(0.45, gt=0, lt=1, description="darkest a shadow may be, as a share of the lit ground")
+    warmup_s: float = Field(20.0, ge=0, le=600, description="s: the empty scene is found in this much footage")
+
+
+class RegionSettings(Section):
+    """Cleaning of the foreground, in metres at the scale of the ground."""
+
+    gap: float = Field(0.3, ge=0, le=5, description="m: gaps up to this size are closed")
+    speck: float = Field(0.12, ge=0, le=5, description="m: specks below this size are removed")
+
+
+class Detector(Protocol):
+    """A source of evidence, asked frame by frame."""
+
+    def evidence(self, frame: Frame) -> Evidence:
+        """What a frame says."""
+
+    def learn(self, frame: Frame, followed: list[Array]) -> None:
+        """Adapt to a frame, except inside the outlines (k, 2) px of what is followed."""
+
+
+class MovingRegions:
+    """What differs from the adaptive background, which begins as `pictures` (H, W, 3) of the scene without its traffic."""
+
+    def __init__(
+        self,
+        camera: GroundCamera,
+        background: BackgroundSettings,
+        cleaning: RegionSettings,
+        smallest_m: float,
+        pictures: Iterable[Image],
+    ) -> None:
+        self._camera = camera
+        self._cleaning = cleaning.gap, cleaning.speck, smallest_m
+        self._bands = region_tools.bands(camera)
+        self._background = Background(
+            background.model, background.threshold, background.shadow_ratio, background.memory_s
+        )
+        self._background.start(empty_picture(pictures))
+
+    def evidence(self, frame: Frame) -> Evidence:
+        return LabelEvidence(self._background.detect(frame.image), self._camera, self._bands, *self._cleaning)
+
+    def learn(self, frame: Frame, followed: list[Array]) -> None:
+        lens = self._camera.ground.lens
+        if lens is not None:
+            followed = [distort_points(outline, lens) for outline in followed if len(outline)]
+        self._background.learn(frame.image, frame.t, followed)
+
+
+class Detections:
+    """Upright boxes from an external detector: frame -> (n, 5) x, y, w, h px and score."""
+
+    def __init__(self, camera: GroundCamera, boxes: dict[int, Array]) -> None:
+        self._camera, self._boxes = camera, boxes
+
+    def evidence(self, frame: Frame) -> Evidence:
+        rows = self._boxes.get(frame.index, np.zeros((0, 5)))
+        found = [region_tools.from_box(row[:4], row[4], self._camera.image_size) for row in rows]
+        lens = self._camera.ground.lens
+        if lens is not None:
+            found = [region_tools.undistorted(region, lens) for region in found]
+        return BoxEvidence(found, self._camera)
+
+    def learn(self, frame: Frame, followed: list[Array]) -> None:
+        """Boxes from outside need no background."""
