@@ -44,7 +44,7 @@ class Detector(Protocol):
 
 
 class MovingRegions:
-    """What differs from the adaptive background, which begins as `pictures` (H, W, 3) of the scene without its traffic."""
+    """What differs from the adaptive background, which begins as `pictures` (H, W, 3) of the scene."""
 
     def __init__(
         self,
