@@ -68,8 +68,8 @@ def read(path: Path) -> GroundMap:
         input=kind,
         image_size=_size(path, document),
         lens=_lens(path, document),
-        rms_m=float(_array(path, document, "rms_m", ())),
-        rms_px=float(_array(path, document, "rms_px", ())),
+        rms_m=_spread(path, document, "rms_m"),
+        rms_px=_spread(path, document, "rms_px"),
         residuals=_residuals(path, document),
         source=str(document.get("source") or ""),
     )
@@ -92,6 +92,13 @@ def _array(path: Path, document: dict[str, Any], key: str, shape: tuple[int, ...
         wanted = "x".join(map(str, shape)) + " finite numbers" if shape else "a finite number"
         raise InputError(f'{path}: "{key}" must be {wanted}')
     return array
+
+
+def _spread(path: Path, document: dict[str, Any], key: str) -> float:
+    value = float(_array(path, document, key, ()))
+    if value < 0:
+        raise InputError(f'{path}: "{key}" is {value:g}; a residual is not negative')
+    return value
 
 
 def _covariance(path: Path, document: dict[str, Any]) -> Array:
