@@ -13,8 +13,8 @@ from visfuse_cli.maths.cameras import project
 from visfuse_cli.records import Array, GroundCamera, Image, Region
 from visfuse_cli.tracking.association import overlap, region_boxes
 from visfuse_cli.vision import contour, regions, wireframe
-from visfuse_cli.vision.background import FOREGROUND, SHADOW
 from visfuse_cli.vision.contour import Look
+from visfuse_cli.vision.labels import Labels
 from visfuse_cli.vision.regions import Band
 from visfuse_cli.vision.wireframe import Outlines
 
@@ -45,24 +45,12 @@ class LabelEvidence:
     def __init__(
         self, labels: Image, camera: GroundCamera, cut: list[Band], gap_m: float, speck_m: float, smallest_m: float
     ) -> None:
-        self._picture: Image | None = labels
-        self._bits: tuple[Image, Image] | None = None
+        self._labels = Labels(labels)
         self._camera, self._cut = camera, cut
         self._cleaning = gap_m, speck_m, smallest_m
 
-    @property
-    def _labels(self) -> Image:
-        if self._picture is None and self._bits is not None:
-            width, _ = self._camera.image_size
-            moved, paint = (np.unpackbits(bits, axis=1, count=width) for bits in self._bits)
-            self._picture = moved * np.uint8(SHADOW) + paint * np.uint8(FOREGROUND - SHADOW)
-        assert self._picture is not None
-        return self._picture
-
     def pack(self) -> None:
-        if self._bits is None:
-            self._bits = np.packbits(self._labels > 0, axis=1), np.packbits(self._labels == FOREGROUND, axis=1)
-        self._picture = None
+        self._labels.pack()
 
     def look(self, pose: Array, size: Array, reach: Array) -> Look:
         owner = contour.owners(self._camera, pose, size)
@@ -73,7 +61,7 @@ class LabelEvidence:
         return contour.search(self._labels, owner, np.zeros(len(pose), int), self._camera, pose, size, reach)
 
     def leftovers(self, pose: Array, size: Array) -> list[Region]:
-        labels = self._labels
+        labels = self._labels.picture()
         explained = np.zeros_like(labels)
         pixels, _ = project(self._camera, wireframe.corners(pose, size))
         for corner in pixels:

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from visfuse_cli.maths.cameras import project
 from visfuse_cli.records import Array, GroundCamera, Image
 from visfuse_cli.vision.background import FOREGROUND
+from visfuse_cli.vision.labels import Labels
 from visfuse_cli.vision.lens import distort_points
 from visfuse_cli.vision.wireframe import DIRECTIONS, EDGES, Outlines, corners, silhouette_edges
 
@@ -70,11 +71,11 @@ class Look:
 
 
 def search(
-    labels: Image, owner: Image, code: NDArray[np.intp], camera: GroundCamera, pose: Array, size: Array, reach: Array
+    labels: Labels, owner: Image, code: NDArray[np.intp], camera: GroundCamera, pose: Array, size: Array, reach: Array
 ) -> Look:
     """Look for the outlines of N boxes with pose (N, 3) and size (N, 3), at most `reach` (N,) px off.
 
-    `labels` and `owner` (H, W) are the picture and whose silhouette is nearest in each pixel (see `owners`); `code`
+    `labels` are the picture and `owner` (H, W) whose silhouette is nearest in each pixel (see `owners`); `code`
     (N,) is what the boxes are called there, 0 when they are not.
     """
     count = len(pose)
@@ -148,16 +149,16 @@ def _share(part: np.ndarray, whole: np.ndarray, weight: Array | float) -> Array:
 
 
 def _look(
-    labels: Image, owner: Image, camera: GroundCamera, points: Array
+    labels: Labels, owner: Image, camera: GroundCamera, points: Array
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Labels, owners and whether they lie in the picture, at points (..., 2) px."""
     if camera.ground.lens is not None:
         points = distort_points(points.reshape(-1, 2), camera.ground.lens).reshape(points.shape)
-    height, width = labels.shape
+    height, width = owner.shape
     whole = np.round(np.clip(points, -2, 1e5)).astype(int)
     u, v = np.clip(whole[..., 0], 0, width - 1), np.clip(whole[..., 1], 0, height - 1)
     inside = (whole[..., 0] > 0) & (whole[..., 0] < width - 1) & (whole[..., 1] > 0) & (whole[..., 1] < height - 1)
-    return labels[v, u], owner[v, u], inside
+    return labels.at(v, u), owner[v, u], inside
 
 
 def _border(evidence: np.ndarray, offset: Array) -> Array:
