@@ -7,6 +7,7 @@ import os
 import sys
 import tempfile
 import traceback
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
@@ -47,6 +48,10 @@ NoProgressOption = Annotated[bool, typer.Option("--no-progress", help="Show no p
 JsonOption = Annotated[bool, typer.Option("--json", help="Print the summary as one JSON object.")]
 QuietOption = Annotated[bool, typer.Option("-q", "--quiet", help="Print nothing but errors.")]
 
+CONFIGURED = {  # command -> where its configuration model is
+    "calibrate-homography": ("visfuse_cli.commands.calibrate_homography", "CalibrateConfig"),
+    "speed": ("visfuse_cli.commands.speed", "SpeedConfig"),
+}
 _quiet = False
 _verbose = False
 
@@ -219,18 +224,14 @@ def config_schema(command: Annotated[str, typer.Argument(metavar="COMMAND")]) ->
 
 def _model(command: str) -> type[Section]:
     """The configuration model of a command."""
-    if command == "speed":
-        from visfuse_cli.commands.speed import SpeedConfig
-
-        return SpeedConfig
-    if command == "calibrate-homography":
-        from visfuse_cli.commands.calibrate_homography import CalibrateConfig
-
-        return CalibrateConfig
+    if command in CONFIGURED:
+        module, name = CONFIGURED[command]
+        model: type[Section] = getattr(import_module(module), name)
+        return model
     from visfuse_cli.config import nearest
 
-    known = ["calibrate-homography", "speed"]
-    raise UsageError(f"no command '{command}' with a configuration{nearest(command, known)}; known: {', '.join(known)}")
+    known = ", ".join(CONFIGURED)
+    raise UsageError(f"no command '{command}' with a configuration{nearest(command, CONFIGURED)}; known: {known}")
 
 
 def _load(command: str, name: str | None, overrides: list[str] | None) -> Any:

@@ -73,6 +73,22 @@ class Lens:
 
 
 @dataclass(frozen=True, slots=True)
+class StereoRig:
+    """Two cameras that do not move against each other: x_right = R x_left + T, R (3, 3), T (3,) m."""
+
+    left: Lens
+    right: Lens
+    R: Array
+    T: Array
+    image_size: tuple[int, int] | None  # (w, h) px, where the calibration names it
+
+    @property
+    def baseline(self) -> float:
+        """Distance of the two optical centres, m."""
+        return float(np.linalg.norm(self.T))
+
+
+@dataclass(frozen=True, slots=True)
 class GroundMap:
     """Image (or gaze frontal plane) to ground metres: a homography with the covariance of its entries.
 
