@@ -27,6 +27,7 @@ from samples.scene import (
 SCENE_STREAM, POINT_STREAM = 0, 4
 FAR_END, NEAR_END = 170.0, -25.0
 KMH = 1 / 3.6
+QUEUE = 5  # vehicles a lane
 
 
 def free_flow(
@@ -52,16 +53,16 @@ def dense(seed: int, seconds: float, size: tuple[int, int] = (1280, 720), fps: F
     """A red light: queues on every lane, trucks that hide cars, long shadows and a camera that shakes by 2 px."""
     rng = np.random.default_rng((seed, SCENE_STREAM))
     road = replace(_random_road(rng), stop_lines=((48.0, 1), (16.0, -1)))
-    camera, placement = _random_view(rng, road, size)
+    camera, placement = _random_view(rng, road, size, slant=25.0)
     red = (0.1 * seconds, 0.6 * seconds)
     vehicles: list[Vehicle] = []
     for x, direction in road.lanes:
         last = len(vehicles)
-        fleet = [random_vehicle(rng, last + i + 1, trucks=0.35) for i in range(9)]
+        fleet = [random_vehicle(rng, last + i + 1, trucks=0.25) for i in range(QUEUE)]
         stop = next(y * way for y, way in road.stop_lines if way == direction) - 1.0
-        gaps = rng.uniform(6, 22, 9) + np.array([vehicle.length for vehicle in fleet])
+        gaps = rng.uniform(8, 25, QUEUE) + np.array([vehicle.length for vehicle in fleet])
         starts = stop - rng.uniform(5, 30) - np.cumsum(gaps)
-        speeds = rng.uniform(9, 13) * np.ones(9)
+        speeds = rng.uniform(9, 13) * np.ones(QUEUE)
         drives = queue(x, direction, list(starts), [v.length for v in fleet], list(speeds), stop, red, seconds)
         vehicles += [replace(vehicle, trajectory=drive) for vehicle, drive in zip(fleet, drives, strict=True)]
     light = _sun(rng, (16, 22))

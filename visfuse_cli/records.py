@@ -15,12 +15,17 @@ Image = NDArray[np.uint8]
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """One decoded picture: `index` is the 0-based decode index, `t` (s) its presentation time less the first stamp."""
+    """One decoded picture: `index` is the 0-based decode index, `t` (s) its presentation time less the first stamp.
+
+    Where the camera was away from its rest and the picture was laid back, `image_from_rest` (3, 3) px leads from the
+    picture as it is here to the one that was recorded.
+    """
 
     camera: str
     index: int
     t: float
     image: Image  # (H, W, 3) BGR
+    image_from_rest: Array | None = None
 
 
 @dataclass(frozen=True, slots=True)

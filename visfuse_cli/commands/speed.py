@@ -1,6 +1,6 @@
 """`visfuse speed`: one fixed camera, a ground homography, and the speed of everything that moves.
 
-frames -> background -> regions -> tracker (predict, measure, update) -> conclude -> judge -> tables and video
+frames -> steady -> background -> regions -> tracker (predict, measure, update) -> conclude -> judge -> tables and video
 """
 
 from __future__ import annotations
@@ -25,8 +25,9 @@ from visfuse_cli.files.video import VideoSource, describe, is_clip_folder, list_
 from visfuse_cli.files.video_writer import VideoWriter
 from visfuse_cli.maths.cameras import ground_camera
 from visfuse_cli.pipeline import Run
-from visfuse_cli.records import Array, GroundCamera, GroundMap, RunRequest, RunResult, TimeAudit
+from visfuse_cli.records import Array, GroundCamera, GroundMap, Image, RunRequest, RunResult, TimeAudit
 from visfuse_cli.tracking.annotate import UNITS, annotate
+from visfuse_cli.tracking.camera_watch import CameraWatch
 from visfuse_cli.tracking.conclude import conclude
 from visfuse_cli.tracking.foreground import BackgroundSettings, Detections, Detector, MovingRegions, RegionSettings
 from visfuse_cli.tracking.ground import GroundTracker
@@ -34,6 +35,8 @@ from visfuse_cli.tracking.output import COLUMNS, Polygon, abandoned_row, lane_of
 from visfuse_cli.tracking.settings import TrackerSettings
 from visfuse_cli.tracking.targets import Abandoned, Track
 from visfuse_cli.tracking.verdict import SpeedSettings, judge
+from visfuse_cli.vision.background import empty_picture
+from visfuse_cli.vision.steady import Steady, at_rest
 
 WARMUP_PICTURES = 31
 SEEN_FRAMES = 8  # a region seen for fewer frames than this is noise and not worth a line in the ledger
@@ -79,6 +82,7 @@ class _Results:
     speeds: list[float] = field(default_factory=list)  # m/s
     drawn: dict[str, list[tuple[int, int]]] = field(default_factory=dict)  # clip -> (first frame, id)
     audits: dict[str, TimeAudit] = field(default_factory=dict)
+    watches: dict[str, CameraWatch] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,7 +129,7 @@ def run(request: RunRequest) -> RunResult:
             for path in clips:
                 if path.name in results.drawn:
                     name = f"annotated-{path.stem}.mp4" if several else "annotated.mp4"
-                    _annotate(path, folder / name, ground, request, run_, spool, results.drawn[path.name])
+                    _annotate(path, folder / name, ground, request, run_, spool, results)
         summary = _summary(results, run_, config, folder)
         write_run_json(
             folder / "run.json",
@@ -140,7 +144,11 @@ def run(request: RunRequest) -> RunResult:
             counts=run_.counts,
             stages=run_.stages,
             stopped_by=run_.stopped_by,
-            extra={"summary": summary, "annotated_by": "a second decode of the footage" if request.video else None},
+            extra={
+                "summary": summary,
+                "camera": {name: watch.report() for name, watch in results.watches.items()},
+                "annotated_by": "a second decode of the footage" if request.video else None,
+            },
         )
     return RunResult(request.out, summary, run_.warnings, run_.stopped_by, run_.stages)
 
@@ -177,8 +185,16 @@ def _track(clip: _Clip, run_: Run, spool: TrackSpool, results: _Results, first_i
     """Follow everything in one clip; returns the next free id."""
     tracker = GroundTracker(clip.camera, clip.config, first_id)
     results.drawn[clip.name] = []
-    look = _detector(clip, run_)
-    for frame in run_.frames(clip.source):
+    with run_.stage("warm up"):
+        empty = empty_picture(at_rest(_sampled(clip.source, clip.config.background.warmup_s)))
+        watch = results.watches[clip.name] = CameraWatch(Steady(empty))
+        look = _detector(clip, empty)
+    for shown in run_.frames(clip.source):
+        run_.count("frames")
+        with run_.stage("steady"):
+            frame = watch.steadied(shown)
+        if frame is None:
+            continue
         with run_.stage("detect"):
             evidence = look.evidence(frame)
         with run_.stage("track"):
@@ -188,21 +204,18 @@ def _track(clip: _Clip, run_: Run, spool: TrackSpool, results: _Results, first_i
             _settle(*ended, clip, tracker, run_, spool, results, label)
         with run_.stage("learn"):
             look.learn(frame, tracker.outlines())
-        run_.count("frames")
     _settle(*tracker.finish(), clip, tracker, run_, spool, results, label)
     audit = results.audits[clip.name] = clip.source.audit()
-    for warning in audit.warnings:
+    for warning in (*audit.warnings, *watch.warnings(clip.name)):
         run_.warn(warning)
     return tracker.next_id
 
 
-def _detector(clip: _Clip, run_: Run) -> Detector:
+def _detector(clip: _Clip, empty: Image) -> Detector:
     if clip.boxes is not None:
         return Detections(clip.camera, clip.boxes)
     config = clip.config
-    with run_.stage("warm up"):
-        pictures = _sampled(clip.source, config.background.warmup_s)
-        return MovingRegions(clip.camera, config.background, config.regions, config.target.smallest, pictures)
+    return MovingRegions(clip.camera, config.background, config.regions, config.target.smallest, empty)
 
 
 def _sampled(source: VideoSource, warmup_s: float) -> Iterator[Any]:
@@ -235,7 +248,7 @@ def _settle(
     for track in tracks:
         path = conclude(track, clip.camera, config, tracker.dynamics)
         verdict = judge(path, clip.camera.ground.cov, config.pose.bias_px, config.speed)
-        spool.add(track_record(path, verdict, clip.camera, label))
+        spool.add(track_record(path, verdict, clip.camera, label, results.watches[clip.name].image_from_rest))
         results.drawn[clip.name].append((int(path.frame[0]), path.id))
         lane = lane_of(path.planar.mean[(verdict.first + verdict.last) // 2, :2], config.lanes)
         row = row_of(path, verdict, clip.name, _utc(begun, path.t[verdict.first]), lane)
@@ -266,18 +279,19 @@ def _annotate(
     request: RunRequest,
     run_: Run,
     spool: TrackSpool,
-    drawn: list[tuple[int, int]],
+    results: _Results,
 ) -> None:
     """Write the annotated video of one clip from a second decode; a stop request ends it early and readable."""
     units = request.config.display.units
     with _open(path, request) as source:
         camera = ground_camera(ground, (source.width, source.height))
-        records = (spool.read(identity) for _, identity in sorted(drawn))
+        records = (spool.read(identity) for _, identity in sorted(results.drawn[path.name]))
+        watch = results.watches[path.name]
         with (
             VideoWriter(out, source.width, source.height, source.nominal_rate) as video,
             run_.background(video) as sink,
         ):
-            for frame in annotate(run_.frames(source), records, camera, units):
+            for frame in annotate(run_.frames(source), records, camera, units, watch):
                 sink.write(frame.image, frame.t)
 
 

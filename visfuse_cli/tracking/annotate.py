@@ -10,9 +10,11 @@ import numpy as np
 from visfuse_cli.maths.cameras import project
 from visfuse_cli.maths.speed import KMH
 from visfuse_cli.records import Array, Frame, GroundCamera, Image
+from visfuse_cli.tracking.camera_watch import CameraWatch
 from visfuse_cli.tracking.output import box_corners
 from visfuse_cli.vision import drawing
 from visfuse_cli.vision.lens import distort_points
+from visfuse_cli.vision.steady import moved
 
 TRAIL_S = 2.0
 UNITS = {"km/h": KMH, "mph": 2.2369362920544, "m/s": 1.0}
@@ -39,15 +41,16 @@ class _Drawn:
             self._text = f"{record['id']}  rejected"
             self._colour = (150, 150, 150)
 
-    def draw(self, image: Image, frame: int) -> None:
+    def draw(self, image: Image, frame: int, image_from_rest: Array) -> None:
         k = self._row.get(frame)
         if k is None:
             return
         begin = int(np.searchsorted(self._t, self._t[k] - TRAIL_S))
-        drawing.polyline(image, self._feet[begin : k + 1], self._colour)
-        drawing.box(image, self._corners[k], self._colour, dashed=not self._measured[k])
-        if np.isfinite(self._corners[k]).all():
-            corner = self._corners[k].min(axis=0)
+        corners = moved(image_from_rest, self._corners[k])
+        drawing.polyline(image, moved(image_from_rest, self._feet[begin : k + 1]), self._colour)
+        drawing.box(image, corners, self._colour, dashed=not self._measured[k])
+        if np.isfinite(corners).all():
+            corner = corners.min(axis=0)
             drawing.label(image, self._text, corner - [0, 4], self._colour)
 
 
@@ -57,7 +60,7 @@ def _on_image(camera: GroundCamera, position: Array) -> Array:
 
 
 def annotate(
-    frames: Iterable[Frame], records: Iterable[dict[str, Any]], camera: GroundCamera, units: str
+    frames: Iterable[Frame], records: Iterable[dict[str, Any]], camera: GroundCamera, units: str, watch: CameraWatch
 ) -> Iterator[Frame]:
     """Draw the tracks, given in the order of their first frames, on the frames; only the tracks in view are held."""
     waiting = iter(records)
@@ -68,7 +71,9 @@ def annotate(
             active.append(_Drawn(upcoming, camera, units))
             upcoming = next(waiting, None)
         active = [drawn for drawn in active if drawn.last >= frame.index]
+        motion = watch.image_from_rest(frame.index)
         for drawn in active:
-            drawn.draw(frame.image, frame.index)
-        drawing.label(frame.image, f"{frame.t:.2f} s", np.array([4.0, frame.image.shape[0]]), (230, 230, 230))
+            drawn.draw(frame.image, frame.index, np.eye(3) if motion is None else motion)
+        note = f"{frame.t:.2f} s" + ("  camera moved: not measured" if watch.was_lost(frame.t) else "")
+        drawing.label(frame.image, note, np.array([4.0, frame.image.shape[0]]), (230, 230, 230))
         yield frame

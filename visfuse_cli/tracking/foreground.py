@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from typing import Literal, Protocol
 
 import numpy as np
@@ -12,8 +11,9 @@ from visfuse_cli.config import Section
 from visfuse_cli.records import Array, Frame, GroundCamera, Image
 from visfuse_cli.tracking.evidence import BoxEvidence, Evidence, LabelEvidence
 from visfuse_cli.vision import regions as region_tools
-from visfuse_cli.vision.background import Background, empty_picture
+from visfuse_cli.vision.background import Background
 from visfuse_cli.vision.lens import distort_points
+from visfuse_cli.vision.steady import moved
 
 
 class BackgroundSettings(Section):
@@ -44,7 +44,7 @@ class Detector(Protocol):
 
 
 class MovingRegions:
-    """What differs from the adaptive background, which begins as `pictures` (H, W, 3) of the scene."""
+    """What differs from the adaptive background, which begins as a picture (H, W, 3) of the empty scene."""
 
     def __init__(
         self,
@@ -52,7 +52,7 @@ class MovingRegions:
         background: BackgroundSettings,
         cleaning: RegionSettings,
         smallest_m: float,
-        pictures: Iterable[Image],
+        empty: Image,
     ) -> None:
         self._camera = camera
         self._cleaning = cleaning.gap, cleaning.speck, smallest_m
@@ -60,7 +60,7 @@ class MovingRegions:
         self._background = Background(
             background.model, background.threshold, background.shadow_ratio, background.memory_s
         )
-        self._background.start(empty_picture(pictures))
+        self._background.start(empty)
 
     def evidence(self, frame: Frame) -> Evidence:
         return LabelEvidence(self._background.detect(frame.image), self._camera, self._bands, *self._cleaning)
@@ -80,6 +80,10 @@ class Detections:
 
     def evidence(self, frame: Frame) -> Evidence:
         rows = self._boxes.get(frame.index, np.zeros((0, 5)))
+        if frame.image_from_rest is not None:
+            middle = np.asarray(rows[:, :2] + rows[:, 2:4] / 2, dtype=float)
+            rows = rows.copy()
+            rows[:, :2] += moved(np.asarray(np.linalg.inv(frame.image_from_rest), dtype=float), middle) - middle
         found = [region_tools.from_box(row[:4], row[4], self._camera.image_size) for row in rows]
         lens = self._camera.ground.lens
         if lens is not None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -15,6 +15,7 @@ from visfuse_cli.tracking.targets import Abandoned
 from visfuse_cli.tracking.verdict import Z95, Verdict
 from visfuse_cli.vision import wireframe
 from visfuse_cli.vision.lens import distort_points
+from visfuse_cli.vision.steady import moved
 
 Polygon = tuple[tuple[float, float], ...]  # corners on the ground, m
 COLUMNS = (
@@ -41,13 +42,23 @@ def box_corners(camera: GroundCamera, pose: Array, size: Array) -> Array:
     return pixels
 
 
-def track_record(path: Path, verdict: Verdict, camera: GroundCamera, clip: str | None) -> dict[str, Any]:
-    """One track of tracks.json."""
+def track_record(
+    path: Path,
+    verdict: Verdict,
+    camera: GroundCamera,
+    clip: str | None,
+    image_from_rest: Callable[[int], Array | None],
+) -> dict[str, Any]:
+    """One track of tracks.json; `image_from_rest` tells where the camera looked in a frame."""
     mean, cov = path.planar.mean, path.planar.cov
     speed = np.linalg.norm(mean[:, 2:], axis=1)
     unit = mean[:, 2:] / np.maximum(speed, 1e-6)[:, None]
     sigma = np.sqrt(np.clip(np.einsum("ti,tij,tj->t", unit, cov[:, 2:, 2:], unit), 0, None))
     pixels = box_corners(camera, np.column_stack([mean[:, :2], path.heading]), np.tile(path.size, (len(mean), 1)))
+    for k, frame in enumerate(path.frame):
+        motion = image_from_rest(int(frame))
+        if motion is not None:
+            pixels[k] = moved(motion, pixels[k])
     low, high = np.nan_to_num(pixels).min(axis=1), np.nan_to_num(pixels).max(axis=1)
     record: dict[str, Any] = {"id": path.id}
     if clip is not None:

@@ -79,8 +79,9 @@ def _best_stretch(
     i, j = (index.ravel() for index in np.meshgrid(grid, grid, indexing="ij"))
     duration, distance = path.t[j] - path.t[i], length[j] - length[i]
     allowed = (duration >= settings.min_duration_s) & (distance >= settings.min_distance_m)
-    jumped = np.cumsum(_jumps(path) > settings.max_acceleration)
-    whole = allowed & (jumped[i] == jumped[j])
+    jumps = _jumps(path) > settings.max_acceleration
+    jumped = np.cumsum(jumps)
+    whole = allowed & (jumped[i] == jumped[j]) & ~jumps[i]
     allowed = whole if whole.any() else allowed
     if not allowed.any():
         allowed = (i == grid[0]) & (j == grid[-1])

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from visfuse_cli.records import Array, Image
 from visfuse_cli.vision.ghosts import find_ghosts
 
 FOREGROUND, SHADOW = 255, 127
-GROUPS = (0.9, 0.75, 0.6, 0.5, 0.4, 0.3)  # shares of a scene's pictures that may show the same
-ALIKE = 16  # grey levels between the least and the largest of the same
+BLOCK = 4  # px: side of the places in which the empty scene is sought
+ALIKE = 6  # grey levels a channel between two sights of the same place
 NOISE = 3.0  # grey levels a channel, of what a picture and its background may differ by where a ghost was
 STILL_S = 1.0  # s that a ghost stands before it is looked for
 KNN_FIRST, KNN_LOOKING = (0.5,) * 10, 1e-9  # rates: it fills its samples one by one, and divides by the logarithm
@@ -100,33 +101,36 @@ class Background:
         self._compared = t, grey, self._labels
 
 
-def empty_picture(images: Iterable[Image]) -> Image:
-    """The scene without its traffic: per pixel and channel, the middle of the values that most of the pictures share.
+def empty_picture(images: Sequence[Image]) -> Image:
+    """The scene without its traffic, from pictures (H, W, 3) in the order of time.
 
-    The largest group of values that are alike is the road, also where vehicles cover it more than half of the time.
+    Where traffic covers a place most of the time the road is what comes back, again and again: in each small block the
+    colour that is seen often and over the longest time. The picture is the mean of those that show it.
     """
-    stack = np.stack(list(images))
-    picture = np.empty(stack.shape[1:], np.uint8)
-    rows = max(1, 4_000_000 // (stack.shape[0] * stack.shape[2] * 3))
-    for top in range(0, stack.shape[1], rows):
-        part = np.sort(stack[:, top : top + rows], axis=0)
-        picture[top : top + rows] = _commonest(part.reshape(len(part), -1)).reshape(part.shape[1:])
-    return picture
+    high, wide = images[0].shape[:2]
+    coarse = (-(-wide // BLOCK), -(-high // BLOCK))
+    blocks = np.stack([cv2.resize(image, coarse, interpolation=cv2.INTER_AREA) for image in images])
+    shows = _recurring(blocks.reshape(len(blocks), -1, 3).transpose(2, 0, 1))
+    total, count = np.zeros((high, wide, 3), np.float32), np.zeros((high, wide), np.float32)
+    for image, shown in zip(images, shows, strict=True):
+        mask = cv2.resize(shown.reshape(coarse[::-1]).astype(np.uint8), (wide, high), interpolation=cv2.INTER_NEAREST)
+        cv2.accumulate(image, total, mask)
+        count += mask
+    return np.asarray(np.rint(total / count[..., None]), dtype=np.uint8)
 
 
-def _commonest(value: Image) -> Image:
-    """The middle (m,) of the largest group of alike values in each column of `value` (n, m), sorted."""
-    count = len(value)
-    found = np.empty(value.shape[1], np.uint8)
-    left = np.arange(value.shape[1])
-    for share in GROUPS:
-        held = max(1, round(share * count))
-        width = value[held - 1 :] - value[: count - held + 1]
-        first = np.argmin(width, axis=0)
-        columns = np.arange(value.shape[1])
-        found[left] = value[first + (held - 1) // 2, columns]
-        loose = width[first, columns] > ALIKE
-        if not loose.any():
-            break
-        value, left = value[:, loose], left[loose]
-    return found
+def _recurring(value: Image) -> NDArray[np.bool_]:
+    """Which of n pictures (n, m) show the colour that comes back over the longest time, value (3, n, m)."""
+    value = np.ascontiguousarray(value)
+    _, count, places = value.shape
+    best, shows = np.zeros(places), np.zeros((count, places), bool)
+    for tried in range(count):
+        apart = np.zeros((count, places), np.uint8)
+        for channel in value:
+            np.maximum(apart, cv2.absdiff(channel, np.broadcast_to(channel[tried], channel.shape)), out=apart)
+        alike = apart <= ALIKE
+        span = count - alike[::-1].argmax(axis=0) - alike.argmax(axis=0)
+        often = alike.sum(axis=0) * span
+        better = often > best
+        best[better], shows[:, better] = often[better], alike[:, better]
+    return shows

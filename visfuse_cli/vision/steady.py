@@ -1,0 +1,170 @@
+"""A camera that shakes or was knocked: where each picture lies against the scene at rest, and the picture laid back."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterable
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from visfuse_cli.records import Array, Image
+
+CELLS, LEAST_POINTS = (16, 10), 12  # across and down: the best corner of each is looked for again
+EDGE = 8  # px from the picture's edge, at least
+WINDOW, LEVELS = (21, 21), 2
+ROUNDS = 6  # of weighing
+AGREE_PX = 1.0  # a corner that is further off does not belong to what stands still
+LEAST_SHARE = 0.15  # of the corners must agree; vehicles hide many, foliage moves
+STILL_PX = 0.12  # less is left as it is: laying a picture back softens it
+FAR_PX = 5.0  # a larger turn of the camera is no similarity in the picture any more
+COARSE_PX = 320  # width at which a knocked camera is found again
+
+
+class Steady:
+    """Registers pictures to a `reference` (H, W, 3) of the scene at rest by the corners of what stands still."""
+
+    def __init__(self, reference: Image) -> None:
+        self._reference = reference
+        self._grey = cv2.cvtColor(reference, cv2.COLOR_BGR2GRAY)
+        self._points = _corners(self._grey)
+        self._sharpness = _sharpness(self._grey, self._points)
+        self._last = np.eye(3)
+        self.middle = (np.array(reference.shape[1::-1]) - 1) / 2  # (2,) px
+
+    def register(self, image: Image) -> Array | None:
+        """`image_from_rest` (3, 3) px of a picture, None where what stands still cannot be found in it.
+
+        Without enough corners in the scene a camera counts as steady.
+        """
+        if len(self._points) < LEAST_POINTS:
+            return np.eye(3)
+        grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+        motion = self._followed(grey, self._last)
+        if motion is None:
+            motion = self._followed(grey, self._coarse(grey))
+        if motion is not None:
+            self._last = motion
+        return motion
+
+    def laid_back(self, image: Image, image_from_rest: Array) -> Image:
+        """The picture as the camera at rest sees it; what lies outside of it is filled from the reference."""
+        if self.shift(image_from_rest) < STILL_PX:
+            return image
+        size, flags = (image.shape[1], image.shape[0]), cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+        filled = self._reference.copy()
+        if np.array_equal(image_from_rest[2], [0, 0, 1]):
+            cv2.warpAffine(image, image_from_rest[:2], size, filled, flags, cv2.BORDER_TRANSPARENT)
+        else:
+            cv2.warpPerspective(image, image_from_rest, size, filled, flags, cv2.BORDER_TRANSPARENT)
+        return filled
+
+    def shift(self, image_from_rest: Array) -> float:
+        """How far (px) the picture's corners and middle are moved at most."""
+        high, wide = self._grey.shape
+        at = np.array([[0, 0], [wide, 0], [0, high], [wide, high], [wide / 2, high / 2]])
+        return float(np.linalg.norm(moved(image_from_rest, at) - at, axis=1).max())
+
+    def _followed(self, grey: Image, expected: Array) -> Array | None:
+        start = moved(expected, self._points.astype(float)).astype(np.float32)
+        found, status, _ = cv2.calcOpticalFlowPyrLK(
+            self._grey,
+            grey,
+            self._points,
+            start,
+            winSize=WINDOW,
+            maxLevel=LEVELS,
+            flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
+        )
+        seen = status.ravel() > 0
+        if np.count_nonzero(seen) < LEAST_POINTS:
+            return None
+        here, there = self._points[seen], found[seen]
+        cv2.setRNGSeed(0)
+        similar, agree = cv2.estimateAffinePartial2D(here, there, ransacReprojThreshold=AGREE_PX)
+        if similar is None:
+            return None
+        agreeing = agree.ravel() > 0
+        motion = _turn(here[agreeing], there[agreeing], self._sharpness[seen][agreeing])
+        if self.shift(motion) > FAR_PX:
+            motion, agree = cv2.findHomography(here, there, cv2.RANSAC, AGREE_PX)
+        enough = max(LEAST_POINTS, LEAST_SHARE * len(self._points))
+        return None if motion is None or np.count_nonzero(agree) < enough else motion
+
+    def _coarse(self, grey: Image) -> Array:
+        """A shift (3, 3) px that brings the reference's edges over the picture's."""
+        scale = COARSE_PX / grey.shape[1]
+        here, there = (_edges(cv2.resize(each, None, fx=scale, fy=scale)) for each in (self._grey, grey))
+        (u, v), _ = cv2.phaseCorrelate(here, there, cv2.createHanningWindow(here.shape[::-1], cv2.CV_32F))
+        return np.array([[1, 0, u / scale], [0, 1, v / scale], [0, 0, 1.0]])
+
+
+def moved(motion: Array, points: Array) -> Array:
+    """Points (..., 2) px under a homography (3, 3)."""
+    mapped = points @ motion[:, :2].T + motion[:, 2]
+    return np.asarray(mapped[..., :2] / mapped[..., 2:])
+
+
+def at_rest(pictures: Iterable[Image]) -> list[Image]:
+    """Pictures (H, W, 3) of one camera, each as seen from the middle of the places where the camera was.
+
+    A picture in which the scene cannot be found again is left out.
+    """
+    waiting = list(pictures)
+    steady = Steady(waiting[0])
+    motions = [steady.register(picture) for picture in waiting]
+    found = [(picture, motion) for picture, motion in zip(waiting, motions, strict=True) if motion is not None]
+    rest = np.median([motion for _, motion in found], axis=0)
+    return [steady.laid_back(picture, motion @ np.linalg.inv(rest)) for picture, motion in found]
+
+
+def _turn(here: NDArray[np.float32], there: NDArray[np.float32], sharpness: Array) -> Array:
+    """The small turn and shift (3, 3) that brings points (k, 2) onto others: a shaken camera does not zoom.
+
+    Each point counts by its sharpness (k, 2, 2), an edge only across itself; those that are off count less and less.
+    """
+    middle = here.mean(axis=0, dtype=float)
+    u, v = (here - middle).T.astype(float)
+    ones, none = np.ones_like(u), np.zeros_like(u)
+    J = np.stack([np.stack([ones, none, -v], axis=-1), np.stack([none, ones, u], axis=-1)], axis=1)  # (k, 2, 3)
+    off = (there - here).astype(float)
+    step, weight = np.zeros(3), ones
+    for _ in range(ROUNDS):
+        J_G = J.transpose(0, 2, 1) @ sharpness * weight[:, None, None]
+        step = np.linalg.solve((J_G @ J).sum(axis=0), (J_G @ off[..., None]).sum(axis=0)[:, 0])
+        error = off - J @ step
+        size = np.einsum("ki,kij,kj->k", error, sharpness, error)
+        weight = 1 / (1 + size / max(float(np.median(size)), 1e-12))
+    R = np.array([[np.cos(step[2]), -np.sin(step[2])], [np.sin(step[2]), np.cos(step[2])]])
+    return np.vstack([np.column_stack([R, step[:2] + middle - R @ middle]), [0, 0, 1]])
+
+
+def _sharpness(grey: Image, points: NDArray[np.float32]) -> Array:
+    """Structure tensors (k, 2, 2) of the picture about points (k, 2): how sharply a shift shows in each direction."""
+    smooth = cv2.GaussianBlur(grey, (3, 3), 0)
+    gu, gv = cv2.Sobel(smooth, cv2.CV_32F, 1, 0), cv2.Sobel(smooth, cv2.CV_32F, 0, 1)
+    u, v = points.astype(int).T
+    uu, uv, vv = (cv2.blur(a * b, WINDOW)[v, u].astype(float) for a, b in ((gu, gu), (gu, gv), (gv, gv)))
+    return np.stack([np.stack([uu, uv], axis=-1), np.stack([uv, vv], axis=-1)], axis=-2) + 1e-6 * np.eye(2)
+
+
+def _corners(grey: Image) -> NDArray[np.float32]:
+    """The best corner (k, 2) px of each cell, those with no contrast at all left out."""
+    quality = cv2.cornerMinEigenVal(cv2.GaussianBlur(grey, (3, 3), 0), 7)
+    across, down = (
+        np.linspace(EDGE, side - EDGE, n + 1).astype(int) for side, n in zip(grey.shape[::-1], CELLS, strict=True)
+    )
+    found = []
+    for top, bottom in itertools.pairwise(down):
+        for left, right in itertools.pairwise(across):
+            cell = quality[top:bottom, left:right]
+            v, u = np.unravel_index(np.argmax(cell), cell.shape)
+            if cell[v, u] > 0:
+                found.append((left + u, top + v))
+    return np.array(found, np.float32).reshape(-1, 2)
+
+
+def _edges(grey: Image) -> Array:
+    smooth = cv2.GaussianBlur(grey, (5, 5), 0)
+    return np.asarray(cv2.magnitude(cv2.Sobel(smooth, cv2.CV_32F, 1, 0), cv2.Sobel(smooth, cv2.CV_32F, 0, 1)))
