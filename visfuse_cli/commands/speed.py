@@ -36,7 +36,7 @@ from visfuse_cli.tracking.settings import TrackerSettings
 from visfuse_cli.tracking.targets import Abandoned, Track
 from visfuse_cli.tracking.verdict import SpeedSettings, judge
 from visfuse_cli.vision.background import empty_picture
-from visfuse_cli.vision.steady import Steady, at_rest
+from visfuse_cli.vision.steady import at_rest
 
 WARMUP_PICTURES = 31
 SEEN_FRAMES = 8  # a region seen for fewer frames than this is noise and not worth a line in the ledger
@@ -187,7 +187,7 @@ def _track(clip: _Clip, run_: Run, spool: TrackSpool, results: _Results, first_i
     results.drawn[clip.name] = []
     with run_.stage("warm up"):
         empty = empty_picture(at_rest(_sampled(clip.source, clip.config.background.warmup_s)))
-        watch = results.watches[clip.name] = CameraWatch(Steady(empty))
+        watch = results.watches[clip.name] = CameraWatch(empty)
         look = _detector(clip, empty)
     for shown in run_.frames(clip.source):
         run_.count("frames")

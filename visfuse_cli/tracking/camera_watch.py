@@ -10,20 +10,24 @@ from typing import Any
 
 import numpy as np
 
-from visfuse_cli.records import Array, Frame
+from visfuse_cli.records import Array, Frame, Image
+from visfuse_cli.vision.exposure import Exposure, levelled
 from visfuse_cli.vision.steady import STILL_PX, Steady, moved
 
 QUIET_FRAMES, LOOK_EVERY = 25, 5  # after so many frames without a change only every so many are looked at
 SETTLED_S = 2.0  # a camera that was knocked stays where it is for longer than a gust lasts
 MOVED_PX, MOVED_SHAKES = 3.0, 3.0  # px, and times the shake, that it must have moved
+STAYS = 0.8  # share of that time
+MAD = 1.4826  # standard deviations in a median absolute deviation
 WORTH_TELLING_PX = 0.5  # of shake
 
 
 class CameraWatch:
     """Registers the frames of one clip to the scene at rest and remembers where the camera looked in each."""
 
-    def __init__(self, steady: Steady) -> None:
-        self._steady = steady
+    def __init__(self, empty: Image) -> None:
+        self._steady, self._exposure = Steady(empty), Exposure(empty)
+        self._gains = 1.0, 1.0  # the least and the largest there were
         self._motion = np.eye(3)
         self._unchanged = 0  # frames
         self._frames, self._entries = array("q"), array("f")  # frames in which it was elsewhere, and 9 numbers for each
@@ -35,7 +39,8 @@ class CameraWatch:
         self._gap: list[float] | None = None  # the present one
 
     def steadied(self, frame: Frame) -> Frame | None:
-        """The frame as the camera at rest sees it, None where the scene cannot be found in it."""
+        """The frame as the camera at rest sees it, as bright as there, None where the scene cannot be found in it."""
+        frame = self._levelled(frame)
         if self._unchanged < QUIET_FRAMES or frame.index % LOOK_EVERY == 0 or self._gap is not None:
             found = self._steady.register(frame.image)
             if found is None:
@@ -52,6 +57,12 @@ class CameraWatch:
         self._entries.extend(self._motion.ravel())
         return replace(frame, image=self._steady.laid_back(frame.image, self._motion), image_from_rest=self._motion)
 
+    def _levelled(self, frame: Frame) -> Frame:
+        gain = self._exposure.gain(frame.image)
+        self._gains = min(self._gains[0], float(gain.min())), max(self._gains[1], float(gain.max()))
+        image = levelled(frame.image, gain)
+        return frame if image is frame.image else replace(frame, image=image)
+
     def image_from_rest(self, frame: int) -> Array | None:
         """Where (3, 3) px the camera looked in a frame, None where it was at rest."""
         k = bisect_left(self._frames, frame)
@@ -64,24 +75,32 @@ class CameraWatch:
         return any(first <= t <= last for first, last in self.lost)
 
     def report(self) -> dict[str, Any]:
-        """What run.json says about the camera: shake (px rms), moves, stretches (s) that could not be measured."""
+        """What run.json says about the camera: shake (px rms), moves, stretches (s) not measured, range of the gain."""
         shake = float(np.sqrt(self._squares / self._count)) if self._count else 0.0
-        return {"shake_px": round(shake, 2), "moves": self.moves, "not_measured": self.lost}
+        return {
+            "shake_px": round(shake, 2),
+            "moves": self.moves,
+            "not_measured": self.lost,
+            "exposure_gain": [round(gain, 3) for gain in self._gains],
+        }
 
     def warnings(self, clip: str) -> list[str]:
         """The same, as sentences."""
-        report, said = self.report(), []
-        if report["shake_px"] > WORTH_TELLING_PX:
-            said.append(f"{clip}: the camera shakes by {report['shake_px']:.1f} px; compensated")
-        said += [
-            f"{clip}: the camera moved by {move['px']:.1f} px at {move['t']:.1f} s; "
-            "registered to where it stood before, but calibrate again"
-            for move in self.moves
-        ]
-        said += [
-            f"{clip}: the scene could not be recognised from {first:.2f} to {last:.2f} s; not measured there"
-            for first, last in report["not_measured"]
-        ]
+        shake, said = self.report()["shake_px"], []
+        if shake > WORTH_TELLING_PX:
+            said.append(f"{clip}: the camera shakes by {shake:.1f} px; compensated")
+        if self.moves:
+            first, largest = self.moves[0]["t"], max(move["px"] for move in self.moves)
+            said.append(
+                f"{clip}: the camera moved, first at {first:.1f} s, by up to {largest:.1f} px; "
+                "registered to where it was at rest, but calibrate again"
+            )
+        if self.lost:
+            first, seconds = self.lost[0][0], sum(end - begin for begin, end in self.lost)
+            said.append(
+                f"{clip}: the scene could not be recognised for {seconds:.2f} s, first at {first:.2f} s; "
+                "not measured there"
+            )
         return said
 
     def _miss(self, t: float) -> None:
@@ -96,12 +115,18 @@ class CameraWatch:
         self._recent.append((t, shift))
         while self._recent[0][0] < t - SETTLED_S:
             self._recent.popleft()
-        place = np.median([each for _, each in self._recent], axis=0)
-        self._squares += float(np.sum((shift - place) ** 2)) / 2
+        recent = np.array([each for _, each in self._recent])
+        place = np.median(recent, axis=0)
+        # of the middle, not of the mean: a knock is no shake
+        self._squares += float(np.sum((MAD * np.median(np.abs(recent - place), axis=0)) ** 2)) / 2
         self._count += 1
         shake = np.sqrt(self._squares / self._count)
-        settled = t - self._recent[0][0] > 0.8 * SETTLED_S
         way = float(np.hypot(*(place - self._place)))
-        if settled and way > max(MOVED_PX, MOVED_SHAKES * shake):
-            self.moves.append({"t": round(self._recent[0][0], 3), "px": round(way, 2)})
+        there = np.hypot(*(recent - place).T) < way / 2
+        if (
+            way > max(MOVED_PX, MOVED_SHAKES * shake)
+            and there.mean() > STAYS
+            and t - self._recent[0][0] > 0.8 * SETTLED_S
+        ):
+            self.moves.append({"t": round(self._recent[int(np.argmax(there))][0], 3), "px": round(way, 2)})
             self._place = place

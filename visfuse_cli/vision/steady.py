@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from visfuse_cli.records import Array, Image
+from visfuse_cli.vision.exposure import Exposure, levelled
 
 CELLS, LEAST_POINTS = (16, 10), 12  # across and down: the best corner of each is looked for again
 EDGE = 8  # px from the picture's edge, at least
@@ -109,10 +110,11 @@ def moved(motion: Array, points: Array) -> Array:
 def at_rest(pictures: Iterable[Image]) -> list[Image]:
     """Pictures (H, W, 3) of one camera, each as seen from the middle of the places where the camera was.
 
-    A picture in which the scene cannot be found again is left out.
+    All are as bright as the first; one in which the scene cannot be found again is left out.
     """
     waiting = list(pictures)
-    steady = Steady(waiting[0])
+    steady, exposure = Steady(waiting[0]), Exposure(waiting[0])
+    waiting = [levelled(picture, exposure.gain(picture)) for picture in waiting]
     motions = [steady.register(picture) for picture in waiting]
     found = [(picture, motion) for picture, motion in zip(waiting, motions, strict=True) if motion is not None]
     rest = np.median([motion for _, motion in found], axis=0)
