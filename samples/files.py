@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from samples.render import frames
 from samples.road import calibration_points
-from samples.scene import Scene, truth_rows
+from samples.scene import Scene
+from samples.visibility import truth_rows
 
 
 def write_scene(scene: Scene, out: Path, *, noise_px: float = 0.4, crf: int = 23, n_points: int = 10) -> None:

@@ -163,13 +163,3 @@ def share_inside(camera: Camera, corners: Array) -> float:
     # pixel centres are at integers: the picture reaches half a pixel beyond the outer centres
     seen = np.minimum(high, np.array(camera.size) - 0.5) - np.maximum(low, -0.5)
     return float(np.prod(np.maximum(seen, 0.0)) / np.prod(high - low))
-
-
-def truth_rows(scene: Scene) -> list[tuple[int, float, int, Array]]:
-    """(frame, t, id, state (5,)) by frame and id, wherever half of the vehicle's box is inside the picture."""
-    rows = []
-    for vehicle in scene.vehicles:
-        for frame, state in enumerate(vehicle.trajectory(scene.times)):
-            if share_inside(scene.camera, vehicle.corners(state)) >= 0.5:
-                rows.append((frame, float(scene.times[frame]), vehicle.id, state))
-    return sorted(rows, key=lambda row: (row[0], row[2]))

@@ -1,5 +1,6 @@
 """The scene generator tells the truth: silhouettes, velocities, times; and the same seed gives the same bytes."""
 
+from collections import Counter
 from dataclasses import replace
 from fractions import Fraction
 from itertools import combinations
@@ -12,9 +13,10 @@ import pytest
 from samples.bodies import Patch
 from samples.files import write_clip, write_scene
 from samples.render import draw, far_to_near, frames, shakes
-from samples.road import KINDS, calibration_points, free_flow
-from samples.scene import FACES, Light, share_inside, truth_rows
+from samples.road import KINDS, calibration_points, dense, free_flow
+from samples.scene import FACES, Light, share_inside
 from samples.ship import SAMPLE, shipped_scene
+from samples.visibility import truth_rows
 
 SMALL = (640, 360)
 WHITE = Light(np.array([0.0, 0.0, 1.0]))
@@ -156,6 +158,14 @@ def test_truth_is_listed_while_half_of_the_box_is_in_the_picture():
         for frame, state in enumerate(vehicle.trajectory(scene.times)):
             inside = share_inside(scene.camera, vehicle.corners(state)) >= 0.5
             assert inside == ((frame, vehicle.id) in listed)
+
+
+def test_truth_leaves_out_what_others_hide():
+    scene = dense(1, 8, SMALL)
+    together = Counter(number for _, _, number, _ in truth_rows(scene))
+    alone = {v.id: len(truth_rows(replace(scene, vehicles=(v,)))) for v in scene.vehicles}
+    assert all(together[number] <= frames for number, frames in alone.items())
+    assert min(together[number] / frames for number, frames in alone.items() if frames) < 0.5
 
 
 def test_the_shipped_sample_is_the_scene_that_makes_it():
