@@ -22,6 +22,7 @@ from visfuse_cli.vision.wireframe import Outlines
 
 START_DOUBT = 5.0  # times the deviations a new track begins with
 SETTLING = 12  # measurements until that doubt is gone
+START_S, LEAST_START = 1.5, 5  # s, and measurements, from which the start is estimated
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,18 +135,35 @@ def _filter_again(
         dynamics.measured(*measure.measurement(fit, k, pose[k])) if samples[k].measured and fit.ok[k] else None
         for k in range(len(samples))
     ]
-    scale = 1.0
+    scale, start = 1.0, _start(samples, measured, pose, dynamics) or steps[0].posterior
     for _ in range(2 if settings.filter.adapt_noise else 1):
-        steps, trusted = _filter(samples, steps[0], measured, scale, float(size[0]), settings, dynamics)
+        steps, trusted = _filter(samples, start, measured, scale, float(size[0]), settings, dynamics)
         nis = _nis(steps)
         if len(nis) >= 5:
             scale *= float(np.clip(np.mean(nis) / len(dynamics.H), 0.2, 25.0))
     return steps, trusted
 
 
+def _start(
+    samples: list[Sample], measured: list[tuple[Array, Array] | None], pose: Array, dynamics: Dynamics
+) -> Gaussian | None:
+    """Where and how fast a track began, by medians over its first measurements: what enters is badly seen at first."""
+    t = np.array([sample.t for sample in samples])
+    used = np.array([z is not None for z in measured]) & (t - t[0] <= START_S)
+    if np.count_nonzero(used) < LEAST_START:
+        return None
+    elapsed = t[used] - t[0]
+    position = np.array([z[0][:2] for z, chosen in zip(measured, used, strict=True) if z is not None and chosen])
+    i, j = np.triu_indices(len(elapsed), 1)
+    velocity = np.median((position[j] - position[i]) / (elapsed[j] - elapsed[i])[:, None], axis=0)
+    begin = np.median(position - elapsed[:, None] * velocity, axis=0)
+    heading = np.arctan2(np.median(np.sin(pose[used, 2])), np.median(np.cos(pose[used, 2])))
+    return dynamics.begin(np.append(begin, heading), velocity)
+
+
 def _filter(
     samples: list[Sample],
-    first: Step,
+    start: Gaussian,
     measured: list[tuple[Array, Array] | None],
     scale: float,
     length: float,
@@ -155,7 +173,7 @@ def _filter(
     """One pass over settled poses, and which of them lay inside the gate; it begins knowing nearly nothing."""
     gate = gate_size(len(dynamics.H), settings.pose.gate)
     H = dynamics.H
-    belief = Gaussian(first.posterior.mean, first.posterior.cov * START_DOUBT**2)
+    belief = Gaussian(start.mean, start.cov * START_DOUBT**2)
     steps: list[Step] = []
     trusted = np.zeros(len(samples), dtype=bool)
     count = 0
