@@ -94,6 +94,38 @@ class StereoRig:
 
 
 @dataclass(frozen=True, slots=True)
+class View:
+    """One of several fixed cameras: x_camera = R x_world + t, R (3, 3), t (3,) m; size (w, h) px of its footage."""
+
+    name: str
+    lens: Lens
+    size: tuple[int, int]
+    R: Array
+    t: Array
+
+    @property
+    def centre(self) -> Array:
+        """The optical centre (3,) in the world, m."""
+        return np.asarray(-self.R.T @ self.t)
+
+
+@dataclass(frozen=True, slots=True)
+class Sighting:
+    """One person in one camera at one instant: the tracked point z (2,) px without distortion, its noise R (2, 2).
+
+    box (4,) px as the picture shows it, and `seen`, the share of the person that is (0 to 1); `dt` (s) from the
+    instant of the set to the camera's own; `colours` (k,), where the footage was looked at.
+    """
+
+    z: Array
+    R: Array
+    box: Array
+    dt: float = 0.0
+    seen: float = 1.0
+    colours: Array | None = None
+
+
+@dataclass(frozen=True, slots=True)
 class GroundMap:
     """Image (or gaze frontal plane) to ground metres: a homography with the covariance of its entries.
 

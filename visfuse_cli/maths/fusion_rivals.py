@@ -1,0 +1,116 @@
+"""Fusion without feedback, for comparison: convex combination, Kim's track-to-track fusion, covariance intersection.
+
+Here every pair of cameras keeps a Kalman filter of its own, and nothing flows back into it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from visfuse_cli.maths.fusion import C
+from visfuse_cli.maths.gaussian import symmetrise, times, transpose
+from visfuse_cli.maths.multiview import project
+from visfuse_cli.records import Array, Gaussian
+
+ROUNDS = 40  # of the weights of covariance intersection
+NEGLIGIBLE = 1e-4  # of the largest eigenvalue: with shared cameras some directions hold rounding and no noise
+
+
+@dataclass(frozen=True, slots=True)
+class Bank:
+    """The local filters of one person: pairs (N, 2) of cameras, mean (N, 6), and the joint covariance (N, 6, N, 6).
+
+    The covariance between two filters comes from the motion's noise, which is one for all, and from shared cameras.
+    """
+
+    pairs: tuple[tuple[int, int], ...]
+    mean: Array
+    joint: Array
+
+    @property
+    def local(self) -> Gaussian:
+        """The local beliefs (N, 6)."""
+        index = np.arange(len(self.pairs))
+        return Gaussian(self.mean, self.joint[index, :, index, :])
+
+
+def started(belief: Gaussian, pairs: tuple[tuple[int, int], ...]) -> Bank:
+    """A bank whose filters all begin with the same belief (6,)."""
+    count = len(pairs)
+    joint = np.broadcast_to(belief.cov[None, :, None, :], (count, 6, count, 6)).copy()
+    return Bank(pairs, np.tile(belief.mean, (count, 1)), joint)
+
+
+def predicted(bank: Bank, F: Array, Q: Array) -> Bank:
+    """Every filter one step ahead, F and Q (6, 6); the same noise strikes all. Wu 2010, eq. 6."""
+    count = len(bank.pairs)
+    joint = np.einsum("ab,ibjc,dc->iajd", F, bank.joint, F) + Q[None, :, None, :]
+    return Bank(bank.pairs, bank.mean @ F.T, joint.reshape(count, 6, count, 6))
+
+
+def updated(bank: Bank, rows: NDArray[np.intp], y: Array, noise: Array) -> Bank:
+    """Filters `rows` (M,) after their measurements y (M, 3), noise (M, M, 3, 3) between them. Wu 2010, eqs. 4-5."""
+    count = len(bank.pairs)
+    prior = bank.local
+    own = np.arange(len(rows))
+    S = symmetrise(prior.cov[rows][:, :3, :3] + noise[own, own])
+    gain = np.zeros((count, 6, 3))
+    gain[rows] = transpose(np.linalg.solve(S, prior.cov[rows][:, :3]))
+    mean = bank.mean.copy()
+    mean[rows] += times(gain[rows], y - bank.mean[rows, :3])
+    keep = np.eye(6) - gain @ C
+    joint = np.einsum("iab,ibjc,jdc->iajd", keep, bank.joint, keep)
+    joint[np.ix_(rows, range(6), rows, range(6))] += np.einsum("iab,ijbc,jdc->iajd", gain[rows], noise, gain[rows])
+    return Bank(bank.pairs, mean, joint)
+
+
+def pair_noise(P: Array, R: Array, pairs: NDArray[np.intp], point: Array, cov: Array) -> Array:
+    """Covariances (M, M, 3, 3) of the pairs' triangulated points (M, 3), those that share a camera included.
+
+    P (K, 3, 4) and R (K, 2, 2) px^2 by camera, pairs (M, 2) of cameras, cov (M, 3, 3) of each point alone.
+    """
+    _, J = project(P[pairs], point[:, None, :])
+    weight = np.linalg.inv(R)
+    gains = np.zeros((len(pairs), len(P), 3, 2))  # of each pair's point to each camera's pixels
+    gains[np.arange(len(pairs))[:, None], pairs] = cov[:, None] @ transpose(J) @ weight[pairs]
+    return np.asarray(np.einsum("ikab,kbc,jkdc->ijad", gains, R, gains))
+
+
+def naive(bank: Bank) -> Gaussian:
+    """Convex combination as if the local estimates (N, 6) were independent ("Austere"): (6,)."""
+    local = bank.local
+    information = np.linalg.inv(local.cov)
+    cov = symmetrise(np.linalg.inv(symmetrise(information.sum(axis=0))))
+    return Gaussian(cov @ times(information, local.mean).sum(axis=0), cov)
+
+
+def kim(bank: Bank) -> Gaussian:
+    """The most likely state (6,) given all local estimates and what correlates them (Kim 1994)."""
+    size = 6 * len(bank.pairs)
+    sigma = symmetrise(bank.joint.reshape(size, size))
+    scale = np.sqrt(np.diagonal(sigma))
+    values, vectors = np.linalg.eigh(sigma / np.outer(scale, scale))
+    used = values > NEGLIGIBLE * values[-1]
+    # Directions without noise repeat what others say, so that they are left out and not divided by.
+    half = (vectors[:, used] / np.sqrt(values[used])).T / scale
+    E = half @ np.tile(np.eye(6), (len(bank.pairs), 1))
+    cov = symmetrise(np.linalg.inv(symmetrise(E.T @ E)))
+    return Gaussian(cov @ (E.T @ (half @ bank.mean.ravel())), cov)
+
+
+def covariance_intersection(bank: Bank) -> Gaussian:
+    """The convex combination (6,) with the smallest determinant that holds for any correlation of the local estimates.
+
+    The weights maximise log det of the combined information by the multiplicative rounds of optimal design.
+    """
+    local = bank.local
+    information = np.linalg.inv(local.cov)
+    weights = np.full(len(bank.pairs), 1 / len(bank.pairs))
+    for _ in range(ROUNDS):
+        cov = np.linalg.inv(np.einsum("i,iab->ab", weights, information))
+        weights = weights * np.einsum("ab,iba->i", cov, information) / 6
+    cov = symmetrise(np.linalg.inv(symmetrise(np.einsum("i,iab->ab", weights, information))))
+    return Gaussian(cov @ np.einsum("i,iab,ib->a", weights, information, local.mean), cov)
