@@ -51,6 +51,7 @@ QuietOption = Annotated[bool, typer.Option("-q", "--quiet", help="Print nothing 
 CONFIGURED = {  # command -> where its configuration model is
     "calibrate-homography": ("visfuse_cli.commands.calibrate_homography", "CalibrateConfig"),
     "speed": ("visfuse_cli.commands.speed", "SpeedConfig"),
+    "fuse-cameras": ("visfuse_cli.commands.fuse_cameras", "FuseConfig"),
 }
 _quiet = False
 _verbose = False
@@ -160,6 +161,52 @@ def speed(
         out=out,
         config=_load("speed", config, set_),
         options={"homography": homography, "detections": detections},
+        overwrite=overwrite,
+        video=not no_video,
+        report=not no_report,
+        start=start,
+        end=end,
+        seed=seed,
+        progress=not (no_progress or quiet or _quiet),
+        argv=tuple(sys.argv),
+    )
+    _report(command.run(request), as_json, quiet, command.text)
+
+
+@app.command("fuse-cameras")
+def fuse_cameras(
+    scene: Annotated[
+        Path, typer.Argument(metavar="SCENE", help="A folder: calibration.toml and the footage (or boxes) of each camera.")
+    ],
+    out: OutOption,
+    estimate_offsets: Annotated[
+        bool, typer.Option("--estimate-offsets", help="Find out from the footage how late each camera is.")
+    ] = False,
+    config: ConfigOption = None,
+    set_: SetOption = None,
+    overwrite: OverwriteOption = False,
+    no_video: NoVideoOption = False,
+    no_report: NoReportOption = False,
+    start: StartOption = None,
+    end: EndOption = None,
+    seed: SeedOption = 0,
+    no_progress: NoProgressOption = False,
+    as_json: JsonOption = False,
+    quiet: QuietOption = False,
+) -> None:
+    """People before several calibrated cameras, in 3D, by closed-loop fusion.
+
+    Example: visfuse fuse-cameras scene --out run
+    """
+    from visfuse_cli.commands import fuse_cameras as command
+    from visfuse_cli.records import RunRequest
+
+    request = RunRequest(
+        command="fuse-cameras",
+        input=scene,
+        out=out,
+        config=_load("fuse-cameras", config, set_),
+        options={"estimate_offsets": estimate_offsets},
         overwrite=overwrite,
         video=not no_video,
         report=not no_report,

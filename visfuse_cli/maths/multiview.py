@@ -65,7 +65,8 @@ def on_plane(P: Array, pixels: Array, height: Array | float = 0.0) -> tuple[Arra
 
     NaN where a ray does not meet it before the camera.
     """
-    image_from_plane = np.stack([P[..., 0], P[..., 1], P[..., 2] * np.asarray(height)[..., None] + P[..., 3]], axis=-1)
+    shifted = P[..., 2] * np.asarray(height)[..., None] + P[..., 3]
+    image_from_plane = np.stack(np.broadcast_arrays(P[..., 0], P[..., 1], shifted), axis=-1)
     plane_from_image = np.linalg.inv(image_from_plane)
     homogeneous = times(plane_from_image[..., :2], pixels) + plane_from_image[..., 2]
     w = homogeneous[..., 2:]

@@ -1,0 +1,168 @@
+"""What a finished track was: filtered again with the noise that its own residuals speak of, and smoothed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from visfuse_cli.fusing.estimate import Sights, at_one_time, fuse, pair_up
+from visfuse_cli.fusing.person import BOX, DT, VARIANCE, Person, Z
+from visfuse_cli.fusing.settings import FuseConfig
+from visfuse_cli.fusing.tracker import RIVALS, motion
+from visfuse_cli.maths import fusion, fusion_rivals, gaussian
+from visfuse_cli.maths.multiview import project
+from visfuse_cli.maths.smoothing import rauch_tung_striebel
+from visfuse_cli.records import Array, Gaussian
+
+START_DOUBT = 2.0  # times the deviations a track began with
+
+
+@dataclass(frozen=True, slots=True)
+class Path:
+    """A finished track over T instants, in the ground's frame, metres and seconds.
+
+    belief (T, 6); seen (T, C) by which cameras; boxes (T, C, 4) px, NaN where not seen; residual (T, C, 2) px of the
+    sightings from the path; weight (T, C) each camera's share of what was measured.
+    """
+
+    id: int
+    frame: NDArray[np.int64]
+    t: Array
+    belief: Gaussian
+    seen: NDArray[np.bool_]
+    boxes: Array
+    residual: Array
+    weight: Array
+    height: float
+    noise: float  # the measurement noise that was found, as a share of the nominal one (variance)
+    sigma_a: float
+    refused: int
+    ended_by: str
+
+
+def conclude(person: Person, P: Array, config: FuseConfig) -> Path | None:
+    """Settle a finished track; None where it was never seen by two cameras for long enough."""
+    rows = person.history.rows
+    seen = np.isfinite(rows[:, :, 0])
+    last = np.flatnonzero(seen.any(axis=1))
+    if not person.confirmed or not len(last):
+        return None
+    person.history.cut(int(last[-1]) + 1)
+    rows, seen = person.history.rows, seen[: last[-1] + 1]
+    t = np.array(person.history.t)
+    pairs = np.flatnonzero(np.count_nonzero(seen, axis=1) >= 2)
+    if t[pairs[-1]] - t[pairs[0]] < config.life.min_duration_s - 1e-9:
+        return None
+    state = person.history.state
+    sights = _sights(rows, seen, state, P)
+    noise, sigma_a = 1.0, config.filter.sigma_a
+    belief = _filtered(person, sights, P, t, state, config, noise, sigma_a)
+    measured = np.column_stack([sights.owner, sights.camera])
+    residual = np.full((*seen.shape, 2), np.nan)
+    pixels, J = project(P[sights.camera], belief.mean[sights.owner, :3])
+    residual[measured[:, 0], measured[:, 1]] = sights.z - pixels
+    return Path(
+        id=person.id,
+        frame=np.array(person.history.frame),
+        t=t,
+        belief=belief,
+        seen=seen,
+        boxes=rows[:, :, BOX],
+        residual=residual,
+        weight=_weights(sights, J, seen.shape),
+        height=person.height.mean,
+        noise=noise,
+        sigma_a=sigma_a,
+        refused=person.refused,
+        ended_by=person.ended_by,
+    )
+
+
+def _sights(rows: Array, seen: NDArray[np.bool_], state: Array, P: Array) -> Sights:
+    """All sightings of a track, the instants as owners, brought to the instants of the sets."""
+    owner, camera = np.nonzero(seen)
+    own = rows[owner, camera]
+    a, b, c = own[:, VARIANCE].T
+    R = np.stack([np.stack([a, b], axis=-1), np.stack([b, c], axis=-1)], axis=-2)
+    return at_one_time(Sights(owner, camera, own[:, Z], R, own[:, DT]), P, Gaussian(state, np.zeros((len(state), 6, 6))))
+
+
+def _filtered(
+    person: Person,
+    sights: Sights,
+    P: Array,
+    t: Array,
+    state: Array,
+    config: FuseConfig,
+    noise: float,
+    sigma_a: float,
+) -> Gaussian:
+    """Beliefs (T, 6) with the measurement noise scaled, smoothed where that is asked for."""
+    scaled = Sights(sights.owner, sights.camera, sights.z, sights.R * noise, sights.dt)
+    belief = Gaussian(person.start.mean, person.start.cov * START_DOUBT**2)
+    step = _pairwise_step(scaled, P, state[:, :3]) if config.fusion.method == "closed-loop" else None
+    bank = None
+    prior, posterior, transitions = [], [], []
+    bounds = np.searchsorted(scaled.owner, np.arange(len(t) + 1))
+    for k in range(len(t)):
+        F, Q = motion(t[k] - t[k - 1] if k else 0.0, sigma_a, config.filter.sigma_z)
+        ahead = gaussian.predict(belief, F, Q) if k else belief
+        now = slice(bounds[k], bounds[k + 1])
+        if now.start == now.stop:
+            belief = ahead
+            bank = fusion_rivals.predicted(bank, F, Q) if bank is not None else None
+        elif step is not None:
+            belief = step(k, ahead)
+        else:
+            bank = fusion_rivals.predicted(bank, F, Q) if bank is not None else None
+            one = Sights(0 * scaled.owner[now], scaled.camera[now], scaled.z[now], scaled.R[now], scaled.dt[now])
+            banks = [bank]
+            after = fuse(config.fusion.method, Gaussian(ahead.mean[None], ahead.cov[None]), one, P, banks)
+            belief, bank = Gaussian(after.mean[0], after.cov[0]), banks[0]
+        prior.append(ahead)
+        posterior.append(belief)
+        transitions.append(F)
+    filtered, predicted = (
+        Gaussian(np.stack([b.mean for b in beliefs]), np.stack([b.cov for b in beliefs]))
+        for beliefs in (posterior, prior)
+    )
+    if not config.smooth:
+        return filtered
+    return rauch_tung_striebel(filtered, predicted, np.stack(transitions))
+
+
+def _pairwise_step(sights: Sights, P: Array, near: Array):
+    """The closed loop's step k from a prediction (6,), all pairs of all instants triangulated at once."""
+    pairs = pair_up(sights, P, near)
+    order = np.argsort(pairs.owner, kind="stable")
+    y, R = pairs.y[order], pairs.R[order]
+    bounds = np.searchsorted(pairs.owner[order], np.arange(len(near) + 1))
+    alone = sights.of(pairs.lone)
+    lone = np.searchsorted(alone.owner, np.arange(len(near) + 1))
+
+    def step(k: int, prior: Gaussian) -> Gaussian:
+        belief = Gaussian(prior.mean[None], prior.cov[None])
+        now = slice(bounds[k], bounds[k + 1])
+        belief = fusion.closed_loop(belief, np.zeros(now.stop - now.start, dtype=np.intp), y[now], R[now])
+        now = slice(lone[k], lone[k + 1])
+        who = np.zeros(now.stop - now.start, dtype=np.intp)
+        belief = fusion.central(belief, who, P[alone.camera[now]], alone.z[now], alone.R[now])
+        return Gaussian(belief.mean[0], belief.cov[0])
+
+    return step
+
+
+def _weights(sights: Sights, J: Array, shape: tuple[int, ...]) -> Array:
+    """Each camera's share (T, C) of the information about the position."""
+    own = np.swapaxes(J, -1, -2) @ np.linalg.inv(sights.R) @ J
+    total = np.zeros((shape[0], 3, 3))
+    np.add.at(total, sights.owner, own)
+    share = np.trace(np.linalg.pinv(total)[sights.owner] @ own, axis1=-2, axis2=-1) / 3
+    weight = np.zeros(shape)
+    weight[sights.owner, sights.camera] = share
+    return weight
+
+
+__all__ = ["RIVALS", "Path", "conclude"]

@@ -1,0 +1,70 @@
+"""A settled path as the record that leaves the program, in the calibration's world."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from visfuse_cli.fusing.conclude import Path
+from visfuse_cli.records import Array, Gaussian
+
+Z95 = 1.959963984540054
+
+
+def in_world(belief: Gaussian, R: Array, t: Array) -> Gaussian:
+    """Beliefs (T, 6) from the ground's frame, x_ground = R x_world + t, back to the world."""
+    both = np.zeros((6, 6))
+    both[:3, :3] = both[3:, 3:] = R.T
+    shift = np.concatenate([t, np.zeros(3)])
+    return Gaussian((belief.mean - shift) @ both.T, both @ belief.cov @ both.T)
+
+
+def track_record(path: Path, names: list[str], R: Array, t: Array) -> dict[str, Any]:
+    """One track of tracks.json; names of the cameras in their order, and x_ground = R x_world + t."""
+    world = in_world(path.belief, R, t)
+    velocity, cov = world.mean[:, 3:], world.cov
+    speed = np.linalg.norm(velocity, axis=1)
+    unit = velocity / np.maximum(speed, 1e-6)[:, None]
+    sigma = np.sqrt(np.clip(np.einsum("ti,tij,tj->t", unit, cov[:, 3:, 3:], unit), 0, None))
+    return {
+        "id": path.id,
+        "class": "person",
+        "summary": _summary(path, names),
+        "states": [
+            {
+                "frame": int(path.frame[k]),
+                "t": float(path.t[k]),
+                "position": world.mean[k, :3].tolist(),
+                "velocity": velocity[k].tolist(),
+                "covariance": cov[k].tolist(),
+                "speed": float(speed[k]),
+                "speed_sigma": float(sigma[k]),
+                "box": {names[c]: path.boxes[k, c].tolist() for c in np.flatnonzero(path.seen[k])},
+                "measured": bool(path.seen[k].any()),
+            }
+            for k in range(len(path.t))
+        ],
+    }
+
+
+def _summary(path: Path, names: list[str]) -> dict[str, Any]:
+    ground, cov = path.belief.mean[:, :2], path.belief.cov
+    duration = float(path.t[-1] - path.t[0])
+    distance = float(np.sum(np.linalg.norm(np.diff(ground, axis=0), axis=1)))
+    mean = distance / duration if duration > 0 else 0.0
+    doubt = np.sqrt(np.trace(cov[0, :2, :2]) / 2 + np.trace(cov[-1, :2, :2]) / 2) / duration if duration > 0 else 0.0
+    used = path.seen.any(axis=1)
+    error = np.sqrt(np.nanmean(np.sum(path.residual**2, axis=2))) if path.seen.any() else None
+    return {
+        "t_start": float(path.t[0]),
+        "t_end": float(path.t[-1]),
+        "n_frames": int(np.count_nonzero(used)),
+        "distance": distance,
+        "speed": mean,
+        "speed_ci95": [max(0.0, mean - Z95 * float(doubt)), mean + Z95 * float(doubt)],
+        "height": path.height,
+        "reprojection_px": None if error is None else float(error),
+        "cameras": {name: int(np.count_nonzero(path.seen[:, c])) for c, name in enumerate(names)},
+        "ended": path.ended_by,
+    }

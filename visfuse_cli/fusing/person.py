@@ -1,0 +1,92 @@
+"""What is held of each person that is followed."""
+
+from __future__ import annotations
+
+from array import array
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from visfuse_cli.maths.fusion_rivals import Bank
+from visfuse_cli.records import Array, Gaussian, Sighting
+
+Z, VARIANCE, BOX, DT = slice(0, 2), slice(2, 5), slice(5, 9), 9  # columns of History.rows
+COLUMNS = 10
+
+
+class History:
+    """What was seen of one person, frame by frame, in few bytes: a row for each camera, NaN where it saw nothing."""
+
+    def __init__(self, cameras: int) -> None:
+        self._cameras = cameras
+        self.frame = array("q")
+        self.t = array("d")
+        self._state = array("d")
+        self._rows = array("d")
+
+    def __len__(self) -> int:
+        return len(self.t)
+
+    def add(self, frame: int, t: float, state: Array, sightings: dict[int, Sighting]) -> None:
+        """Keep one instant: the person's position and velocity (6,) as then believed, and the sightings by camera."""
+        rows = np.full((self._cameras, COLUMNS), np.nan)
+        for camera, sight in sightings.items():
+            rows[camera, Z], rows[camera, BOX], rows[camera, DT] = sight.z, sight.box, sight.dt
+            rows[camera, VARIANCE] = sight.R[0, 0], sight.R[0, 1], sight.R[1, 1]
+        self.frame.append(frame)
+        self.t.append(t)
+        self._state.extend(state)
+        self._rows.extend(rows.ravel())
+
+    @property
+    def state(self) -> Array:
+        """Position and velocity (T, 6) as believed at the time."""
+        return np.array(self._state, dtype=float).reshape(-1, 6)
+
+    @property
+    def rows(self) -> Array:
+        """Sightings (T, C, COLUMNS)."""
+        return np.array(self._rows, dtype=float).reshape(-1, self._cameras, COLUMNS)
+
+    def cut(self, length: int) -> None:
+        """Forget what came after the first `length` instants."""
+        del self.frame[length:], self.t[length:], self._state[6 * length :]
+        del self._rows[length * self._cameras * COLUMNS :]
+
+
+@dataclass(slots=True)
+class Scale:
+    """A length of the body that is learnt: mean (m) and how many looks stand behind it."""
+
+    mean: float
+    looks: float
+
+    def learn(self, value: float, weight: float = 1.0, longest: float = 400.0) -> None:
+        """Take in one look."""
+        self.looks = min(self.looks + weight, longest)
+        self.mean += (value - self.mean) * weight / self.looks
+
+
+@dataclass(slots=True)
+class Person:
+    """A person followed: the belief of position and velocity (6,), body, looks, and what was seen so far."""
+
+    id: int
+    belief: Gaussian
+    start: Gaussian
+    height: Scale
+    width: Scale
+    history: History
+    t: float
+    last_seen: float
+    bank: Bank | None = None
+    colours: Array | None = None
+    seen_frames: int = 0  # instants at which two cameras or more saw it
+    first_seen: float = 0.0
+    last_pair: float = 0.0  # s: when two cameras or more last saw it
+    refused: int = 0
+    refused_since: float | None = None
+    confirmed: bool = False
+    ended_by: str = ""
+    cameras: set[int] = field(default_factory=set)
+    last: dict[int, Sighting] = field(default_factory=dict)
