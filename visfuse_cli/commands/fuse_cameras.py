@@ -26,6 +26,7 @@ from visfuse_cli.fusing.output import track_record
 from visfuse_cli.fusing.person import Person
 from visfuse_cli.fusing.settings import FuseConfig
 from visfuse_cli.fusing.tracker import Tracker
+from visfuse_cli.fusing.visibility import visibility
 from visfuse_cli.maths import multiview
 from visfuse_cli.pipeline import Run
 from visfuse_cli.records import Array, FrameSet, RunRequest, RunResult, View
@@ -150,8 +151,10 @@ def _track(
             sightings = watch.look(boxes, dt, tracker)
         with run_.stage("fuse"):
             tracker.update(frame, sightings)
+            inside, clear = visibility(tracker.beliefs, scene.views, scene.P, config)
+            tracker.miss(clear & np.isin(np.arange(len(scene.P)), list(dt)))
+            ended = tracker.end(instant.t, np.count_nonzero(inside, axis=1))
             tracker.begin(frame, instant.t, watch.newcomers(tracker))
-            ended = tracker.end(instant.t, _in_view(scene, tracker))
         with run_.stage("settle"):
             _settle(ended, scene, config, run_, spool, results)
     with run_.stage("settle"):
@@ -170,18 +173,6 @@ def _boxes(scene: _Scene, instant: FrameSet) -> tuple[dict[int, Array], dict[int
         if rows is not None:
             boxes[index] = rows
     return boxes, dt
-
-
-def _in_view(scene: _Scene, tracker: Tracker) -> np.ndarray:
-    """How many cameras' pictures hold each person (T,)."""
-    place = tracker.beliefs.mean[:, None, :3]
-    if not len(place):
-        return np.zeros(0, dtype=int)
-    pixels, _ = multiview.project(scene.P, place)
-    size = np.array([view.size for view in scene.views])
-    with np.errstate(invalid="ignore"):
-        inside = np.all((pixels > 0) & (pixels < size - 1), axis=-1)
-    return np.asarray(np.count_nonzero(inside, axis=1))
 
 
 def _settle(

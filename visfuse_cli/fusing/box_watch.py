@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from visfuse_cli.fusing.settings import FuseConfig
 from visfuse_cli.fusing.tracker import Newcomer, Tracker
+from visfuse_cli.fusing.visibility import visibility
 from visfuse_cli.maths import multiview, people
 from visfuse_cli.maths.assignment import assign, gate_size
 from visfuse_cli.maths.gaussian import log_density, mahalanobis
@@ -14,6 +15,7 @@ from visfuse_cli.records import Array, Gaussian, Sighting, View
 from visfuse_cli.vision.lens import undistort_points
 from visfuse_cli.vision.matching import Boxes, agree, groups
 
+PLACE_SIGMA = 0.1  # m: what a place changes by as other cameras come to see the person
 GROUND_SIGMA = 0.03  # m: how flat the ground is taken to be
 
 
@@ -57,8 +59,25 @@ class BoxWatch:
             height = float(np.sum(boxes.height[used] * weight) / np.sum(weight))
             if not person.shortest < height < person.tallest:
                 continue
+            apart = np.linalg.norm(tracker.beliefs.mean[:, :2] - agreed[0].mean[:2], axis=1)
+            if np.any(apart < self._config.life.nearest):
+                continue
             found.append(Newcomer(self._on_ground(agreed[0], height), self._sightings(used), height))
-        return found
+        return self._undenied(found, tracker)
+
+    def _undenied(self, found: list[Newcomer], tracker: Tracker) -> list[Newcomer]:
+        """Those newcomers whom more cameras see than have a clear sight of the place and do not."""
+        known = tracker.beliefs
+        mean = np.zeros((len(known.mean) + len(found), 6))
+        mean[: len(known.mean)] = known.mean
+        for k, new in enumerate(found, start=len(known.mean)):
+            mean[k, :3] = new.place.mean
+        _, clear = visibility(Gaussian(mean, np.zeros((0, 6, 6))), self._views, self._P, self._config)
+        return [
+            new
+            for new, sights in zip(found, clear[len(known.mean) :], strict=True)
+            if len(set(np.flatnonzero(sights).tolist()) - set(new.sightings)) < len(new.sightings)
+        ]
 
     def _on_ground(self, point: Gaussian, height: float) -> Gaussian:
         """The same point, knowing that people stand on the ground."""
@@ -140,14 +159,18 @@ class BoxWatch:
         mean = np.stack([places[k].mean for k in usable])
         cov = np.stack([places[k].cov for k in usable])
         residual = mean[None] - beliefs.mean[:, None, :2]
-        S = beliefs.cov[:, None, :2, :2] + cov[None]
+        S = beliefs.cov[:, None, :2, :2] + cov[None] + PLACE_SIGMA**2 * np.eye(2)
         cost = -log_density(residual, S)  # n = 2, the size of what is measured: Wu 2010, eq. 7
         cost = np.where(mahalanobis(residual, S) < gate_size(2, self._config.sight.gate), cost, np.inf)
         alone = np.array([len(grouped[k]) < 2 for k in usable])
         new = np.array([not person.confirmed for person in tracker.people])
         cost[np.ix_(new, alone)] = np.inf  # one camera alone begins nobody
-        pairs, _, _ = assign(cost + 2.0 * alone)
-        return {int(who): usable[int(which)] for who, which in pairs}
+        given: dict[int, int] = {}
+        for turn in (~new, new):  # who is known for longer has the first claim
+            taken = np.isin(usable, list(given.values()))
+            pairs, _, _ = assign(np.where(turn[:, None] & ~taken, cost + 2.0 * alone, np.inf))
+            given |= {int(who): usable[int(which)] for who, which in pairs}
+        return given
 
     def _sightings(self, group: NDArray[np.intp]) -> dict[int, Sighting]:
         boxes = self._boxes

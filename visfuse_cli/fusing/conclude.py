@@ -16,6 +16,7 @@ from visfuse_cli.maths.multiview import project
 from visfuse_cli.maths.smoothing import rauch_tung_striebel
 from visfuse_cli.records import Array, Gaussian
 
+DENIED = 1  # camera or more with a clear sight that speak against a prediction
 START_DOUBT = 2.0  # times the deviations a track began with
 
 
@@ -35,6 +36,7 @@ class Path:
     boxes: Array
     residual: Array
     weight: Array
+    told: NDArray[np.bool_]
     height: float
     noise: float  # the measurement noise that was found, as a share of the nominal one (variance)
     sigma_a: float
@@ -72,6 +74,7 @@ def conclude(person: Person, P: Array, config: FuseConfig) -> Path | None:
         boxes=rows[:, :, BOX],
         residual=residual,
         weight=_weights(sights, J, seen.shape),
+        told=seen.any(axis=1) | (np.array(person.history.denied) < DENIED),
         height=person.height.mean,
         noise=noise,
         sigma_a=sigma_a,

@@ -43,7 +43,7 @@ def track_record(path: Path, names: list[str], R: Array, t: Array) -> dict[str, 
                 "box": {names[c]: path.boxes[k, c].tolist() for c in np.flatnonzero(path.seen[k])},
                 "measured": bool(path.seen[k].any()),
             }
-            for k in range(len(path.t))
+            for k in np.flatnonzero(path.told)
         ],
     }
 

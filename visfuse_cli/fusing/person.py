@@ -23,6 +23,7 @@ class History:
         self.t = array("d")
         self._state = array("d")
         self._rows = array("d")
+        self.denied = array("b")  # cameras with a clear sight of the place that did not see it
 
     def __len__(self) -> int:
         return len(self.t)
@@ -35,6 +36,7 @@ class History:
             rows[camera, VARIANCE] = sight.R[0, 0], sight.R[0, 1], sight.R[1, 1]
         self.frame.append(frame)
         self.t.append(t)
+        self.denied.append(0)
         self._state.extend(state)
         self._rows.extend(rows.ravel())
 
@@ -50,7 +52,7 @@ class History:
 
     def cut(self, length: int) -> None:
         """Forget what came after the first `length` instants."""
-        del self.frame[length:], self.t[length:], self._state[6 * length :]
+        del self.frame[length:], self.t[length:], self.denied[length:], self._state[6 * length :]
         del self._rows[length * self._cameras * COLUMNS :]
 
 
@@ -84,6 +86,7 @@ class Person:
     seen_frames: int = 0  # instants at which two cameras or more saw it
     first_seen: float = 0.0
     last_pair: float = 0.0  # s: when two cameras or more last saw it
+    missed: int = 0  # times that a camera did not see it where nothing hid it, since it was last seen
     refused: int = 0
     refused_since: float | None = None
     confirmed: bool = False

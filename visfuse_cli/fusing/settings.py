@@ -93,6 +93,9 @@ class LifeSettings(Section):
     confirm_s: float = Field(0.3, ge=0, le=60, description="s: a person must be seen this long by two cameras or more")
     confirm_frames: int = Field(3, ge=1, le=100, description="sets of frames it must be seen in")
     max_coast_s: float = Field(2.0, gt=0, le=60, description="s: prediction without measurement before a track ends")
+    max_missed: int = Field(
+        40, ge=1, le=100000, description="times that cameras with a clear sight of the place may not see somebody"
+    )
     min_duration_s: float = Field(0.8, ge=0, le=600, description="s: a track that was measured for less is dropped")
     nearest: float = Field(0.25, gt=0, le=5, description="m: two people cannot stand nearer to each other")
 

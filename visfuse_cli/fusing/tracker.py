@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from visfuse_cli.fusing.estimate import Sights, at_one_time, consistent, fuse
 from visfuse_cli.fusing.person import History, Person, Scale
@@ -95,7 +96,7 @@ class Tracker:
             person.belief = Gaussian(after.mean[k], after.cov[k])
             self._remember(person, frame, seen)
 
-    def _expected(self, used: Sights, good: np.ndarray, prior: Gaussian) -> np.ndarray:
+    def _expected(self, used: Sights, good: NDArray[np.bool_], prior: Gaussian) -> NDArray[np.bool_]:
         """Rows (M,) whose person is, by all of them together, where it can be; others are refused for a while."""
         after = fuse("central", prior, used, self.P, [])
         keep = good.copy()
@@ -120,7 +121,7 @@ class Tracker:
     def _remember(self, person: Person, frame: int, seen: dict[int, Sighting]) -> None:
         person.last = seen
         if seen:
-            person.last_seen = person.t
+            person.last_seen, person.missed = person.t, 0
             person.cameras |= set(seen)
         if len(seen) >= 2:
             person.seen_frames += 1
@@ -151,7 +152,14 @@ class Tracker:
             self._remember(person, frame, new.sightings)
             self.people.append(person)
 
-    def end(self, t: float, in_view: np.ndarray) -> list[Person]:
+    def miss(self, clear: NDArray[np.bool_]) -> None:
+        """Take note of who was not seen though cameras had a clear sight of the place (T, C)."""
+        for person, open_sights in zip(self.people, clear, strict=True):
+            if not person.last:
+                person.history.denied[-1] = int(np.count_nonzero(open_sights))
+                person.missed += person.history.denied[-1]
+
+    def end(self, t: float, in_view: NDArray[np.intp]) -> list[Person]:
         """Let go whom nobody has seen for long, or who left; `in_view` (T,) counts the cameras whose picture holds it."""
         life = self.config.life
         ended = []
@@ -160,7 +168,7 @@ class Tracker:
                 unseen = t - person.last_pair
                 gone = "never confirmed" if unseen > max(life.confirm_s, 1e-9) * 1.5 and not person.last else ""
                 gone = gone or ("never confirmed" if t - person.first_seen > 4 * life.confirm_s + 1.0 else "")
-            elif t - person.last_seen > life.max_coast_s:
+            elif t - person.last_seen > life.max_coast_s or person.missed >= life.max_missed:
                 gone = "lost"
             elif views < 2 and t - person.last_pair > life.max_coast_s / 2:
                 gone = "left"
