@@ -11,6 +11,8 @@ STRIDE = 8  # every so many pixels are compared, across and down
 TOO_DARK, TOO_BRIGHT = 12, 243  # grey levels that say nothing about brightness
 LEAST_SHARE = 0.05  # of the compared pixels must say something
 SAME = 0.015  # a gain closer to 1 is none
+NEAR, BINS = 0.05, np.linspace(-2, 2, 201)  # of the logarithm of a gain
+STILL_SHARE = 0.15  # of the pixels that agree with the last gain keep it
 
 
 class Exposure:
@@ -18,19 +20,29 @@ class Exposure:
 
     def __init__(self, reference: Image) -> None:
         self._reference = np.ascontiguousarray(reference[::STRIDE, ::STRIDE]).astype(np.float32)
+        self._gain = np.ones(3)
 
     def gain(self, image: Image) -> Array:
         """What (3,) to multiply the channels of a picture with; exactly 1 where it is as bright as the reference.
 
-        The median over the picture: what moves covers less than half of it.
+        What most of the pixels say that agree with one another: shadows and vehicles may cover more than half of the
+        picture, but the last gain stays as long as a part of it still agrees.
         """
         here = image[::STRIDE, ::STRIDE]
-        usable = (here > TOO_DARK) & (here < TOO_BRIGHT) & (self._reference > TOO_DARK)
-        if usable.all(axis=-1).mean() < LEAST_SHARE:
+        usable = ((here > TOO_DARK) & (here < TOO_BRIGHT) & (self._reference > TOO_DARK)).all(axis=-1)
+        if usable.mean() < LEAST_SHARE:
             return np.ones(3)
-        ratio = np.where(usable, self._reference / np.maximum(here, 1), np.nan)
-        gain = np.nanmedian(ratio.reshape(-1, 3), axis=0).astype(float)
-        return np.ones(3) if np.abs(gain - 1).max() < SAME else gain
+        ratio = np.log(self._reference[usable] / here[usable])
+        green = ratio[:, 1]
+        agree = np.abs(green - np.log(self._gain[1])) < NEAR
+        if agree.mean() < STILL_SHARE:
+            votes = np.convolve(np.histogram(green, BINS)[0], np.ones(5), mode="same")
+            peak = int(np.argmax(votes))
+            agree = np.abs(green - (BINS[peak] + BINS[peak + 1]) / 2) < NEAR
+        if agree.mean() < STILL_SHARE:  # not the same place, or not quite: only the middle is left to go by
+            agree[:] = True
+        self._gain = np.exp(np.median(ratio[agree], axis=0).astype(float))
+        return np.ones(3) if np.abs(self._gain - 1).max() < SAME else self._gain
 
 
 def levelled(image: Image, gain: Array) -> Image:
