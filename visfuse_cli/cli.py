@@ -53,6 +53,8 @@ CONFIGURED = {  # command -> where its configuration model is
     "speed": ("visfuse_cli.commands.speed", "SpeedConfig"),
     "fuse-cameras": ("visfuse_cli.commands.fuse_cameras", "FuseConfig"),
 }
+BY = ("hour", "day", "weekday", "lane", "direction")
+FORMS = ("table", "csv", "json", "parquet")
 _quiet = False
 _verbose = False
 
@@ -136,6 +138,13 @@ def speed(
         Path | None,
         typer.Option("--detections", metavar="F", help="MOTChallenge boxes instead of background subtraction."),
     ] = None,
+    log: Annotated[
+        Path | None,
+        typer.Option("--log", metavar="F.sqlite", help="Add each recording's vehicles to this traffic log."),
+    ] = None,
+    new_only: Annotated[
+        bool, typer.Option("--new-only", help="Of a folder, only clips that the log does not hold; to DIR/<clip>/.")
+    ] = False,
     config: ConfigOption = None,
     set_: SetOption = None,
     overwrite: OverwriteOption = False,
@@ -170,7 +179,56 @@ def speed(
         progress=not (no_progress or quiet or _quiet),
         argv=tuple(sys.argv),
     )
-    _report(command.run(request), as_json, quiet, command.text)
+    if log is not None:
+        from visfuse_cli.apps import traffic_log
+
+        _report(traffic_log.run(request, log, new_only), as_json, quiet, traffic_log.text)
+    elif new_only:
+        raise UsageError("--new-only needs --log: the log is what tells which clips are new")
+    else:
+        _report(command.run(request), as_json, quiet, command.text)
+
+
+@app.command("summary")
+def summary(
+    log: Annotated[Path, typer.Argument(metavar="F.sqlite", help="A traffic log, written by speed --log.")],
+    by: Annotated[
+        str | None, typer.Option("--by", metavar="WHAT", help="hour, day, weekday, lane or direction.")
+    ] = None,
+    since: Annotated[
+        str | None, typer.Option("--since", metavar="TIME", help="ISO 8601; vehicles from then on.")
+    ] = None,
+    until: Annotated[
+        str | None, typer.Option("--until", metavar="TIME", help="ISO 8601; vehicles before then.")
+    ] = None,
+    limit: Annotated[
+        float | None, typer.Option("--limit", metavar="KMH", min=0, help="Share of vehicles above this speed, km/h.")
+    ] = None,
+    zone: Annotated[str, typer.Option("--zone", help="Time zone of hours and days, like Europe/Vienna.")] = "UTC",
+    form: Annotated[str, typer.Option("--format", metavar="FORM", help="table, csv, json or parquet.")] = "table",
+    out: Annotated[Path | None, typer.Option("--out", metavar="FILE", help="To a file instead of the screen.")] = None,
+) -> None:
+    """What a traffic log says: counts, mean, 50th and 85th percentile with intervals, pace, share above a limit.
+
+    Example: visfuse summary site.sqlite --by hour --limit 50
+    """
+    from visfuse_cli.apps import summary as command
+
+    if by not in (None, *BY):
+        raise UsageError(f"--by {by}: one of {', '.join(BY)}")
+    if form not in FORMS:
+        raise UsageError(f"--format {form}: one of {', '.join(FORMS)}")
+    if form == "parquet" and out is None:
+        raise UsageError("--format parquet is no text; name a file with --out")
+    found = command.summarise(log, by, since, until, limit, zone)  # type: ignore[arg-type]
+    if form == "parquet" and out is not None:
+        command.write_parquet(found, out)
+    elif out is not None:
+        from visfuse_cli.files.atomic import write_text
+
+        write_text(out, command.as_text(found, form) + "\n")  # type: ignore[arg-type]
+    else:
+        typer.echo(command.as_text(found, form))  # type: ignore[arg-type]
 
 
 @app.command("fuse-cameras")

@@ -23,6 +23,7 @@ from visfuse_cli.files.runfolder import RunFolder
 from visfuse_cli.files.spool import TrackSpool, write_table
 from visfuse_cli.files.video import VideoSource, describe, is_clip_folder, list_clips, open_source
 from visfuse_cli.files.video_writer import VideoWriter
+from visfuse_cli.files.wall_clock import began, known_zone
 from visfuse_cli.maths.cameras import ground_camera
 from visfuse_cli.pipeline import Run
 from visfuse_cli.records import Array, GroundCamera, GroundMap, Image, RunRequest, RunResult, TimeAudit
@@ -48,6 +49,21 @@ class VideoSettings(Section):
     fps: float | None = Field(None, gt=0, le=10000, description="frames/s of an image folder without timestamps.csv")
 
 
+class ClockSettings(Section):
+    """When recordings began, by the clock on the wall."""
+
+    pattern: str | None = Field(
+        None, description="strptime pattern of a clip's whole name without its ending, like cam1_%Y%m%d-%H%M%S"
+    )
+    zone: str = Field("UTC", description="IANA time zone of the times in names, like Europe/Vienna")
+
+    @field_validator("zone")
+    @classmethod
+    def _known(cls, zone: str) -> str:
+        known_zone(zone)
+        return zone
+
+
 class DisplaySettings(Section):
     """Annotation and screen only; tables keep their units."""
 
@@ -58,6 +74,7 @@ class SpeedConfig(TrackerSettings):
     """Configuration of `visfuse speed`."""
 
     video: VideoSettings = VideoSettings()
+    clock: ClockSettings = ClockSettings()
     background: BackgroundSettings = BackgroundSettings()
     regions: RegionSettings = RegionSettings()
     speed: SpeedSettings = SpeedSettings()
@@ -82,6 +99,7 @@ class _Results:
     speeds: list[float] = field(default_factory=list)  # m/s
     drawn: dict[str, list[tuple[int, int]]] = field(default_factory=dict)  # clip -> (first frame, id)
     audits: dict[str, TimeAudit] = field(default_factory=dict)
+    began: dict[str, datetime | None] = field(default_factory=dict)
     watches: dict[str, CameraWatch] = field(default_factory=dict)
 
 
@@ -106,10 +124,11 @@ def run(request: RunRequest) -> RunResult:
     inputs = [
         describe(path) for path in (*clips, request.options["homography"], request.options.get("detections")) if path
     ]
+    results = _Results()
     for path in clips:
         with _open(path, request) as source:
             _check_size(source, ground, path)
-    results = _Results()
+            results.began[path.name] = began(path, config.clock.pattern, config.clock.zone, source.creation_time)
     with (
         RunFolder(request.out, request.overwrite) as folder,
         Run(request.progress) as run_,
@@ -146,6 +165,7 @@ def run(request: RunRequest) -> RunResult:
             stopped_by=run_.stopped_by,
             extra={
                 "summary": summary,
+                "began_utc": {name: _utc(moment, 0.0) or None for name, moment in results.began.items()},
                 "camera": {name: watch.report() for name, watch in results.watches.items()},
                 "annotated_by": "a second decode of the footage" if request.video else None,
             },
@@ -244,7 +264,7 @@ def _settle(
     label: str | None,
 ) -> None:
     """Turn what ended into records and table rows."""
-    config, begun = clip.config, clip.source.creation_time
+    config, begun = clip.config, results.began[clip.name]
     for track in tracks:
         path = conclude(track, clip.camera, config, tracker.dynamics)
         verdict = judge(path, clip.camera.ground.cov, config.pose.bias_px, config.speed)

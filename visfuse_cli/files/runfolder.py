@@ -21,12 +21,14 @@ class RunFolder:
 
     Enter it once every input is validated: with `overwrite` the earlier run's results go on entering, and nothing
     else does. A folder that holds only what a killed run left behind counts as empty. Raises OutputError where the
-    folder is not empty or cannot be made, BusyError where another run holds it.
+    folder is not empty or cannot be made, BusyError where another run holds it. A `shared` folder is one above
+    several runs: it is locked, and nothing in it is touched.
     """
 
-    def __init__(self, out: str | Path, overwrite: bool = False) -> None:
+    def __init__(self, out: str | Path, overwrite: bool = False, *, shared: bool = False) -> None:
         self.path = Path(out)
         self.overwrite = overwrite
+        self.shared = shared
         self._lock = -1
         self._created = False
 
@@ -38,7 +40,8 @@ class RunFolder:
             self.path.mkdir(parents=True, exist_ok=True)
             self._acquire()
             try:
-                self._clear()
+                if not self.shared:
+                    self._clear()
             except BaseException:
                 self._release()
                 raise

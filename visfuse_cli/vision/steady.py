@@ -17,7 +17,7 @@ EDGE = 8  # px from the picture's edge, at least
 WINDOW, LEVELS = (21, 21), 2
 ROUNDS = 6  # of weighing
 AGREE_PX = 1.0  # a corner that is further off does not belong to what stands still
-LEAST_SHARE = 0.15  # of the corners must agree; vehicles hide many, foliage moves
+LEAST_AGREEING, LEAST_SHARE = 8, 0.15  # of the corners must agree; vehicles hide many, foliage moves
 STILL_PX = 0.12  # less is left as it is: laying a picture back softens it
 FAR_PX = 5.0  # a larger turn of the camera is no similarity in the picture any more
 COARSE_PX = 320  # width at which a knocked camera is found again
@@ -31,6 +31,8 @@ class Steady:
         self._grey = cv2.cvtColor(reference, cv2.COLOR_BGR2GRAY)
         self._points = _corners(self._grey)
         self._sharpness = _sharpness(self._grey, self._points)
+        self._weight = np.linalg.det(self._sharpness) ** 0.25
+        self._weight /= max(float(self._weight.sum()), 1e-9)
         self._last = np.eye(3)
         self.middle = (np.array(reference.shape[1::-1]) - 1) / 2  # (2,) px
 
@@ -90,8 +92,13 @@ class Steady:
         motion = _turn(here[agreeing], there[agreeing], self._sharpness[seen][agreeing])
         if self.shift(motion) > FAR_PX:
             motion, agree = cv2.findHomography(here, there, cv2.RANSAC, AGREE_PX)
-        enough = max(LEAST_POINTS, LEAST_SHARE * len(self._points))
-        return None if motion is None or np.count_nonzero(agree) < enough else motion
+            if motion is None:
+                return None
+            agreeing = agree.ravel() > 0
+        # painted lines say more than the grain of asphalt, which compression wipes off
+        found_again = max(np.count_nonzero(agreeing) / len(self._points), self._weight[seen][agreeing].sum())
+        recognised = np.count_nonzero(agreeing) >= LEAST_AGREEING and found_again >= LEAST_SHARE
+        return motion if recognised else None
 
     def _coarse(self, grey: Image) -> Array:
         """A shift (3, 3) px that brings the reference's edges over the picture's."""

@@ -1,0 +1,34 @@
+"""Percentiles of speeds with confidence intervals that assume no distribution, and the pace."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.stats import binom
+
+from visfuse_cli.records import Array
+
+
+def percentile(values: Array, share: float, confidence: float = 0.95) -> tuple[float, float | None, float | None]:
+    """The percentile of values (n,) and its interval by order statistics; None where n is too small for an end.
+
+    The number of values below the true percentile is binomial, whatever they are distributed like.
+    """
+    ordered = np.sort(np.asarray(values, dtype=float))
+    tail, count = (1 - confidence) / 2, len(ordered)
+    low = int(binom.ppf(tail, count, share))  # the largest rank that lies below the percentile surely enough
+    while low > 0 and binom.cdf(low - 1, count, share) > tail:
+        low -= 1
+    high = int(binom.ppf(1 - tail, count, share)) + 1
+    return (
+        float(np.quantile(ordered, share)),
+        float(ordered[low - 1]) if low > 0 else None,
+        float(ordered[high - 1]) if high <= count else None,
+    )
+
+
+def pace(speeds: Array, width: float) -> tuple[float, float]:
+    """Lower end of the range of this width that holds most speeds (n,), and the share of them in it."""
+    ordered = np.sort(np.asarray(speeds, dtype=float))
+    held = np.searchsorted(ordered, ordered + width, side="right") - np.arange(len(ordered))
+    first = int(np.argmax(held))
+    return float(ordered[first]), float(held[first] / len(ordered))
