@@ -19,9 +19,9 @@ from visfuse_cli.files.runfolder import RunFolder
 from visfuse_cli.files.scene import check_scene
 from visfuse_cli.files.spool import TrackSpool
 from visfuse_cli.files.video import VideoSource, describe
-from visfuse_cli.fusing.box_watch import BoxWatch
 from visfuse_cli.fusing.conclude import Path as Settled
 from visfuse_cli.fusing.conclude import conclude
+from visfuse_cli.fusing.eyes import BoxEyes, Eyes, PictureEyes
 from visfuse_cli.fusing.output import track_record
 from visfuse_cli.fusing.person import Person
 from visfuse_cli.fusing.settings import FuseConfig
@@ -29,7 +29,7 @@ from visfuse_cli.fusing.tracker import Tracker
 from visfuse_cli.fusing.visibility import visibility
 from visfuse_cli.maths import multiview
 from visfuse_cli.pipeline import Run
-from visfuse_cli.records import Array, FrameSet, RunRequest, RunResult, View
+from visfuse_cli.records import Array, RunRequest, RunResult, View
 
 __all__ = ["FuseConfig", "run", "text"]
 
@@ -138,49 +138,47 @@ def _track(
     results: _Results,
 ) -> None:
     """Follow everybody through the whole footage."""
-    tracker = Tracker(scene.P, config)
-    watch = BoxWatch(scene.views, scene.P, config)
+    with run_.stage("warm up"):
+        eyes = _eyes(scene, sources, config)
+    tracker = Tracker(eyes.P, config)
     tolerance = 0.55 / min(source.nominal_rate for source in sources.values())
     for instant in run_.synchronise(sources, tolerance, offsets):
         run_.count("sets of frames")
         frame = instant.frames[scene.names[0]].index
-        boxes, dt = _boxes(scene, instant)
+        with run_.stage("detect"):
+            eyes.detect(instant)
         with run_.stage("fuse"):
             tracker.predict(instant.t)
         with run_.stage("look"):
-            sightings = watch.look(boxes, dt, tracker)
+            sightings = eyes.look(tracker)
         with run_.stage("fuse"):
             tracker.update(frame, sightings)
-            inside, clear = visibility(tracker.beliefs, scene.views, scene.P, config)
-            tracker.miss(clear & np.isin(np.arange(len(scene.P)), list(dt)))
+            inside, clear = visibility(tracker.beliefs, eyes.sizes, eyes.P, config)
+            tracker.miss(clear & eyes.open)
             ended = tracker.end(instant.t, np.count_nonzero(inside, axis=1))
-            tracker.begin(frame, instant.t, watch.newcomers(tracker))
+        with run_.stage("newcomers"):
+            tracker.begin(frame, instant.t, eyes.newcomers(tracker))
+        with run_.stage("learn"):
+            eyes.learn(instant.t, tracker)
         with run_.stage("settle"):
-            _settle(ended, scene, config, run_, spool, results)
+            _settle(ended, eyes.P, scene, config, run_, spool, results)
     with run_.stage("settle"):
-        _settle(tracker.finish(), scene, config, run_, spool, results)
+        _settle(tracker.finish(), eyes.P, scene, config, run_, spool, results)
 
 
-def _boxes(scene: _Scene, instant: FrameSet) -> tuple[dict[int, Array], dict[int, float]]:
-    """The boxes of the cameras that are in a set, and how far (s) each is from the set's instant."""
-    boxes, dt = {}, {}
-    for index, each in enumerate(scene.footage):
-        frame = instant.frames.get(each.view.name)
-        if frame is None or each.boxes is None:
-            continue
-        dt[index] = frame.t - instant.t
-        rows = each.boxes.get(frame.index)
-        if rows is not None:
-            boxes[index] = rows
-    return boxes, dt
+def _eyes(scene: _Scene, sources: dict[str, VideoSource], config: FuseConfig) -> Eyes:
+    """What looks at each set of frames: boxes from outside where there are any, else the pictures."""
+    if scene.footage[0].boxes is not None:
+        return BoxEyes(scene.views, [each.boxes or {} for each in scene.footage], config)
+    return PictureEyes(scene.views, list(sources.values()), config)
 
 
 def _settle(
-    ended: list[Person], scene: _Scene, config: FuseConfig, run_: Run, spool: TrackSpool, results: _Results
+    ended: list[Person], P: Array, scene: _Scene, config: FuseConfig, run_: Run, spool: TrackSpool, results: _Results
 ) -> None:
     """Turn whom nobody follows any more into records."""
     for person in ended:
-        path: Settled | None = conclude(person, scene.P, config)
+        path: Settled | None = conclude(person, P, config)
         if path is None:
             reason = person.ended_by if not person.confirmed else "too short"
             results.rejected[reason] = results.rejected.get(reason, 0) + 1

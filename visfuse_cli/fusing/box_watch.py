@@ -24,6 +24,7 @@ class BoxWatch:
 
     def __init__(self, views: list[View], P: Array, config: FuseConfig) -> None:
         self._views, self._P, self._config = views, P, config
+        self._sizes = np.array([view.size for view in views])
         self._left: list[NDArray[np.intp]] = []
         self._boxes: Boxes | None = None
         self._shown: Array = np.zeros((0, 4))
@@ -72,7 +73,7 @@ class BoxWatch:
         mean[: len(known.mean)] = known.mean
         for k, new in enumerate(found, start=len(known.mean)):
             mean[k, :3] = new.place.mean
-        _, clear = visibility(Gaussian(mean, np.zeros((0, 6, 6))), self._views, self._P, self._config)
+        _, clear = visibility(Gaussian(mean, np.zeros((0, 6, 6))), self._sizes, self._P, self._config)
         return [
             new
             for new, sights in zip(found, clear[len(known.mean) :], strict=True)

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from visfuse_cli.fusing.settings import FuseConfig
 from visfuse_cli.maths import multiview, people
-from visfuse_cli.records import Array, Gaussian, View
+from visfuse_cli.records import Array, Gaussian
 
 HIDDEN = 0.3  # share of a person behind another from which on the sight is not clear
 
@@ -26,14 +26,13 @@ def expected_boxes(P: Array, foot: Array, height: Array, width: Array) -> Array:
 
 
 def visibility(
-    beliefs: Gaussian, views: list[View], P: Array, config: FuseConfig
+    beliefs: Gaussian, size: Array, P: Array, config: FuseConfig
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Which cameras' pictures hold each person's middle (T, C), and which show it with nobody before it (T, C)."""
+    """Which cameras' pictures, sizes (C, 2) px, hold each person's middle (T, C), and which show it whole (T, C)."""
     count = len(beliefs.mean)
     usual = np.full(count, config.person.height)
     foot = standing(beliefs, usual, config)
     box = expected_boxes(P, foot, usual, np.full(count, config.person.width))
-    size = np.array([view.size for view in views])
     with np.errstate(invalid="ignore"):
         middle = (box[..., :2] + box[..., 2:]) / 2
         inside = np.all((middle > 0) & (middle < size - 1), axis=-1)

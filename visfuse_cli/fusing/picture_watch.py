@@ -1,0 +1,175 @@
+"""The people in each set of pictures: backgrounds taken away, silhouettes measured around who is expected."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from visfuse_cli.fusing.person import Person, Scale
+from visfuse_cli.fusing.settings import FuseConfig
+from visfuse_cli.fusing.sighting import expect, learn_lengths, own_sides, tracked_point
+from visfuse_cli.fusing.tracker import PRIOR_LOOKS, Newcomer, Tracker, beginning
+from visfuse_cli.records import Array, Gaussian, Image, Sighting
+from visfuse_cli.vision import silhouettes
+from visfuse_cli.vision.background import Background
+from visfuse_cli.vision.matching import agree
+from visfuse_cli.vision.occupancy import Occupancy
+from visfuse_cli.vision.silhouettes import Expected
+from visfuse_cli.vision.straighten import Straight
+
+LEAST_SHARE = 0.2  # of a person that a camera must see
+TRIES = 10  # places looked at in one set of pictures
+ROUNDS = 3  # in which a newcomer's place and box settle
+START_SIGMA = 0.15  # m: how far a place of the search may be off
+FLOATING_M = 0.35  # how far from the ground a newcomer may seem to stand
+MARGIN = 0.12  # share of its height around somebody followed in which nobody new is looked for, and nothing learnt
+
+
+class Camera:
+    """One camera's eye: straight pictures, their background, and what moves in the latest."""
+
+    def __init__(self, straight: Straight, empty: Image, config: FuseConfig) -> None:
+        settings = config.background
+        self.straight = straight
+        self._background = Background(settings.model, settings.threshold, settings.shadow_ratio, settings.memory_s)
+        self._background.start(empty)
+        self._picture: Image = empty
+        self.mask: Image = np.zeros(empty.shape[:2], np.uint8)
+
+    def look(self, image: Image) -> None:
+        """Find out what moves in a frame of the footage."""
+        self._picture = self.straight.picture(image)
+        self.mask = silhouettes.moving(self._background.detect(self._picture))
+
+    def learn(self, t: float, boxes: Array) -> None:
+        """Adapt to the latest picture, except inside boxes [u0, v0, u1, v1] (n, 4) px."""
+        self._background.learn(self._picture, t, [box[[0, 1, 2, 1, 2, 3, 0, 3]].reshape(4, 2) for box in boxes])
+
+
+class PictureWatch:
+    """Turns each set of pictures into sightings of people, under cameras P (C, 3, 4) that lead to straight pixels."""
+
+    def __init__(self, cameras: list[Camera], P: Array, config: FuseConfig) -> None:
+        self._cameras, self._P, self._config = cameras, P, config
+        sizes = np.array([camera.straight.size for camera in cameras])
+        self._occupancy = Occupancy(P, sizes, config.person.height)
+        self._dt: dict[int, float] = {}
+
+    def look(self, dt: dict[int, float], tracker: Tracker) -> list[dict[int, Sighting]]:
+        """Sightings of everybody followed, by the cameras in `dt` (s), whose pictures were looked at."""
+        self._dt = dt
+        expected = self._expected(tracker.people)
+        return [self._sightings(expected, k, person.height, person.width) for k, person in enumerate(tracker.people)]
+
+    def newcomers(self, tracker: Tracker) -> list[Newcomer]:
+        """People in what moves and belongs to nobody who is followed."""
+        expected = self._expected(tracker.people)
+        left = {camera: self._cameras[camera].mask.copy() for camera in self._dt}
+        for camera, mask in left.items():
+            for box in self._widened(expected[camera].box):
+                _clear(mask, box)
+        found: list[Newcomer] = []
+        tried = [person.belief.mean[:2] for person in tracker.people]
+        nearest = self._config.life.nearest
+        for _ in range(TRIES):
+            place = self._occupancy.likeliest(left, tried, nearest)
+            if place is None:
+                break
+            new = self._newcomer(place, tracker.people)
+            if new is not None and min((np.linalg.norm(new.place.mean[:2] - p) for p in tried), default=9.0) > nearest:
+                found.append(new)
+                tried.append(new.place.mean[:2])
+                for camera, box in self._boxes_of(new).items():
+                    _clear(left[camera], box)
+            tried.append(place)
+        return found
+
+    def learn(self, t: float, tracker: Tracker) -> None:
+        """Let the backgrounds adapt where nobody is."""
+        expected = self._expected(tracker.people)
+        for camera in self._dt:
+            self._cameras[camera].learn(t, self._widened(expected[camera].box))
+
+    def _expected(self, people: list[Person]) -> list[Expected]:
+        return expect(
+            self._P,
+            _stacked([person.belief for person in people]),
+            np.array([person.height.mean for person in people]),
+            np.array([person.width.mean for person in people]),
+            np.array([0 if person.confirmed else 1 for person in people], dtype=np.intp),
+            self._config,
+        )
+
+    def _sightings(self, expected: list[Expected], who: int, height: Scale, width: Scale) -> dict[int, Sighting]:
+        """What each camera sees of one of the expected people, whose lengths are learnt."""
+        found = {}
+        sigma = float(np.hypot(self._config.person.height_sigma / np.sqrt(max(height.looks / PRIOR_LOOKS, 1)), 0.03))
+        for camera, dt in self._dt.items():
+            there = expected[camera]
+            if not (np.isfinite(there.box[who]).all() and there.depth[who] > 0):
+                continue
+            seen = silhouettes.sides(self._cameras[camera].mask, there, who)
+            if seen is None or seen.share < LEAST_SHARE:
+                continue
+            own = own_sides(seen, there.box[who], float(there.scale[who]))
+            measured = tracked_point(there, who, seen, own, sigma, self._config)
+            if measured is not None:
+                shown = self._cameras[camera].straight.shown(seen.box[None])[0]
+                found[camera] = Sighting(*measured, shown, dt, min(seen.share, 1.0))
+                learn_lengths(height, width, there, who, seen, own)
+        return found
+
+    def _newcomer(self, place: Array, people: list[Person]) -> Newcomer | None:
+        """Whoever stands near a place (2,) m, if two cameras or more agree on it and on somebody of human size."""
+        person = self._config.person
+        height, width = Scale(person.height, 2.0), Scale(person.width, 2.0)
+        level = 0.0 if self._config.fusion.point == "foot" else height.mean / 2
+        at = Gaussian(np.array([*place, level]), START_SIGMA**2 * np.eye(3))
+        sightings: dict[int, Sighting] = {}
+        for _ in range(ROUNDS):
+            belief = beginning(at, self._config)
+            everybody = [*(other.belief for other in people), belief]
+            expected = expect(
+                self._P,
+                _stacked(everybody),
+                np.array([*(other.height.mean for other in people), height.mean]),
+                np.array([*(other.width.mean for other in people), width.mean]),
+                np.array([0] * len(people) + [1], dtype=np.intp),
+                self._config,
+            )
+            sightings = self._sightings(expected, len(people), height, width)
+            cameras = sorted(sightings)
+            if len(cameras) < 2:
+                return None
+            z, R = (np.stack([getattr(sightings[camera], name) for camera in cameras]) for name in ("z", "R"))
+            agreed = agree(self._P[cameras], z, R)
+            if agreed is None:
+                return None
+            point, used = agreed
+            at = Gaussian(point.mean, point.cov)
+            sightings = {camera: sightings[camera] for camera, good in zip(cameras, used, strict=True) if good}
+        level = at.mean[2] - (0.0 if self._config.fusion.point == "foot" else height.mean / 2)
+        if abs(level) > FLOATING_M or not person.shortest < height.mean < person.tallest:
+            return None
+        return Newcomer(at, sightings, height.mean)
+
+    def _boxes_of(self, new: Newcomer) -> dict[int, Array]:
+        usual = np.array([new.height]), np.array([self._config.person.width]), np.zeros(1, dtype=np.intp)
+        expected = expect(self._P, _stacked([beginning(new.place, self._config)]), *usual, self._config)
+        return {camera: self._widened(expected[camera].box)[0] for camera in self._dt}
+
+    @staticmethod
+    def _widened(boxes: Array) -> Array:
+        """Boxes (n, 4) px with a margin; those that are not finite are left out."""
+        boxes = boxes[np.isfinite(boxes).all(axis=1)]
+        return boxes + MARGIN * (boxes[:, 3:] - boxes[:, 1:2]) * [-1, -1, 1, 1]
+
+
+def _stacked(beliefs: list[Gaussian]) -> Gaussian:
+    if not beliefs:
+        return Gaussian(np.zeros((0, 6)), np.zeros((0, 6, 6)))
+    return Gaussian(np.stack([belief.mean for belief in beliefs]), np.stack([belief.cov for belief in beliefs]))
+
+
+def _clear(mask: Image, box: Array) -> None:
+    u0, v0, u1, v1 = np.maximum(np.rint(box), 0).astype(int)
+    mask[v0:v1, u0:u1] = 0
