@@ -8,15 +8,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from visfuse_cli.fusing.estimate import Sights, at_one_time, fuse, pair_up
+from visfuse_cli.fusing.noise import disagreement, restlessness
 from visfuse_cli.fusing.person import BOX, DT, VARIANCE, Person, Z
 from visfuse_cli.fusing.settings import FuseConfig
 from visfuse_cli.fusing.tracker import RIVALS, motion
 from visfuse_cli.maths import fusion, fusion_rivals, gaussian
+from visfuse_cli.maths.gaussian import times
 from visfuse_cli.maths.multiview import project
 from visfuse_cli.maths.smoothing import rauch_tung_striebel
 from visfuse_cli.records import Array, Gaussian
 
 DENIED = 1  # camera or more with a clear sight that speak against a prediction
+BODY_SIGMA = 0.012  # m: what all cameras err alike, hair, shoes and bags
 START_DOUBT = 2.0  # times the deviations a track began with
 
 
@@ -61,10 +64,17 @@ def conclude(person: Person, P: Array, config: FuseConfig) -> Path | None:
     sights = _sights(rows, seen, state, P)
     noise, sigma_a = 1.0, config.filter.sigma_a
     belief = _filtered(person, sights, P, t, state, config, noise, sigma_a)
-    measured = np.column_stack([sights.owner, sights.camera])
-    residual = np.full((*seen.shape, 2), np.nan)
     pixels, J = project(P[sights.camera], belief.mean[sights.owner, :3])
-    residual[measured[:, 0], measured[:, 1]] = sights.z - pixels
+    if config.filter.adapt and config.smooth:
+        noise, once = disagreement(sights, sights.z - pixels, t)
+        sigma_a = restlessness(*_places(sights, pixels, J, belief, once), t, sigma_a, config.filter.sigma_z, person.start)
+        belief = _filtered(person, sights, P, t, state, config, noise, sigma_a)
+        pixels, J = project(P[sights.camera], belief.mean[sights.owner, :3])
+    cov = belief.cov.copy()
+    cov[:, :3, :3] += BODY_SIGMA**2 * np.eye(3)
+    belief = Gaussian(belief.mean, cov)
+    residual = np.full((*seen.shape, 2), np.nan)
+    residual[sights.owner, sights.camera] = sights.z - pixels
     return Path(
         id=person.id,
         frame=np.array(person.history.frame),
@@ -155,6 +165,19 @@ def _pairwise_step(sights: Sights, P: Array, near: Array):
         return Gaussian(belief.mean[0], belief.cov[0])
 
     return step
+
+
+def _places(sights: Sights, pixels: Array, J: Array, belief: Gaussian, noise: float) -> tuple[Array, Array]:
+    """Where each instant's sightings alone, their noise scaled, put the person: (T, 3) and (T, 3, 3); NaN without."""
+    weight = np.linalg.inv(sights.R * noise)
+    information, vector = np.zeros((len(belief.mean), 3, 3)), np.zeros((len(belief.mean), 3))
+    J_W = np.swapaxes(J, -1, -2) @ weight
+    np.add.at(information, sights.owner, J_W @ J)
+    np.add.at(vector, sights.owner, times(J_W, sights.z - pixels))
+    known = np.bincount(sights.owner, minlength=len(belief.mean)) >= 2
+    R = np.full_like(information, np.nan)
+    R[known] = np.linalg.pinv(information[known], hermitian=True)
+    return belief.mean[:, :3] + times(R, vector), R
 
 
 def _weights(sights: Sights, J: Array, shape: tuple[int, ...]) -> Array:

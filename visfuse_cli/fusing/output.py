@@ -66,5 +66,7 @@ def _summary(path: Path, names: list[str]) -> dict[str, Any]:
         "height": path.height,
         "reprojection_px": None if error is None else float(error),
         "cameras": {name: int(np.count_nonzero(path.seen[:, c])) for c, name in enumerate(names)},
+        "noise": path.noise,
+        "sigma_a": path.sigma_a,
         "ended": path.ended_by,
     }

@@ -7,7 +7,7 @@ import numpy as np
 from visfuse_cli.maths.multiview import project
 from visfuse_cli.records import Array
 
-RINGS = ((0.0, 0.2), (0.45, 0.8), (0.8, 1.0), (1.0, 0.3))  # share of the height, share of half the width
+RINGS = ((0.0, 0.45), (0.45, 0.8), (0.8, 1.0), (1.0, 0.3))  # share of the height, share of half the width
 AROUND = np.linspace(0, 2 * np.pi, 8, endpoint=False)
 CIRCLE = np.column_stack([np.cos(AROUND), np.sin(AROUND)])
 
