@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 
 import numpy as np
@@ -38,6 +38,7 @@ class Walker:
     trousers: Colour
     times: Array
     knots: Array
+    jointed: bool = True
 
     def states(self, t: Array) -> Array:
         """x, y, vx, vy (n, 4) at times t (n,)."""
@@ -48,7 +49,7 @@ class Walker:
         return np.column_stack([curve(when).mean(axis=1), curve.derivative()(when).mean(axis=1)])
 
     def parts(self, state: Array, heading: float, way: float) -> list[Part]:
-        """The body at one state (4,), facing `heading` rad, after `way` m of walk."""
+        """The body at one state (4,), facing `heading` rad, after `way` m of walk; a pillar where it is not jointed."""
         h = self.height
         pace = min(float(np.hypot(*state[2:])) / 1.2, 1.0)
         swing = 0.32 * pace * np.sin(np.pi * way / STEP_M)
@@ -59,6 +60,12 @@ class Walker:
         def at(forward: float, side: float, up: float) -> Array:
             return np.asarray(foot + forward * ahead + side * left + np.array([0, 0, up]))
 
+        if not self.jointed:
+            return [
+                Part(at(0, 0, 0.12 * h), at(0, 0, 0.5 * h), 0.12 * h, 0.12 * h, self.trousers),
+                Part(at(0, 0, 0.5 * h), at(0, 0, 0.72 * h), 0.12 * h, 0.12 * h, self.shirt),
+                Part(at(0, 0, 0.92 * h), at(0, 0, 0.91 * h), 0.08 * h, 0.08 * h, self.skin),
+            ]
         hip, shoulder = 0.5 * h, 0.8 * h
         parts = [
             Part(at(0, 0, hip), at(0, 0, shoulder - 0.02 * h), 0.09 * h, 0.1 * h, self.shirt),
@@ -113,6 +120,7 @@ def crossing(
     size: tuple[int, int] = (640, 480),
     fps: Fraction = Fraction(20),
     stand_s: float = 0.0,
+    jointed: bool = True,
 ) -> Yard:
     """People who come from different sides, cross in the middle within a second and go on; cameras all around."""
     rng = np.random.default_rng((seed, 7))
@@ -125,7 +133,7 @@ def crossing(
         # wide enough that a person at the yard's edge stays in the picture
         focal = size[0] / 2 / np.tan(np.arctan2(3.6, far)) * rng.uniform(0.85, 1.1)
         views[f"cam{k + 1}"] = looking_at(centre, np.array([0, 0, 0.8]), focal, size, rng.normal(0, 0.03))
-    walkers = _walkers(rng, people, seconds, stand_s)
+    walkers = [replace(walker, jointed=jointed) for walker in _walkers(rng, people, seconds, stand_s)]
     names = list(views)
     return Yard(views, dict.fromkeys(names, fps), dict.fromkeys(names, 0.0), tuple(walkers), seconds, seed)
 

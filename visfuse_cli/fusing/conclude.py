@@ -19,7 +19,7 @@ from visfuse_cli.maths.smoothing import rauch_tung_striebel
 from visfuse_cli.records import Array, Gaussian
 
 DENIED = 1  # camera or more with a clear sight that speak against a prediction
-BODY_SIGMA = 0.012  # m: what all cameras err alike, hair, shoes and bags
+BODY_SIGMA = 0.005  # m, times the root of the noise found: what cameras err alike, as by feet that point ahead
 START_DOUBT = 2.0  # times the deviations a track began with
 
 
@@ -71,7 +71,7 @@ def conclude(person: Person, P: Array, config: FuseConfig) -> Path | None:
         belief = _filtered(person, sights, P, t, state, config, noise, sigma_a)
         pixels, J = project(P[sights.camera], belief.mean[sights.owner, :3])
     cov = belief.cov.copy()
-    cov[:, :3, :3] += BODY_SIGMA**2 * np.eye(3)
+    cov[:, :3, :3] += BODY_SIGMA**2 * noise * np.eye(3)
     belief = Gaussian(belief.mean, cov)
     residual = np.full((*seen.shape, 2), np.nan)
     residual[sights.owner, sights.camera] = sights.z - pixels
@@ -85,7 +85,7 @@ def conclude(person: Person, P: Array, config: FuseConfig) -> Path | None:
         residual=residual,
         weight=_weights(sights, J, seen.shape),
         told=seen.any(axis=1) | (np.array(person.history.denied) < DENIED),
-        height=person.height.mean,
+        height=person.body.height.mean,
         noise=noise,
         sigma_a=sigma_a,
         refused=person.refused,

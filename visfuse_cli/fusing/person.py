@@ -12,6 +12,7 @@ from visfuse_cli.records import Array, Gaussian, Sighting
 
 Z, VARIANCE, BOX, DT = slice(0, 2), slice(2, 5), slice(5, 9), 9  # columns of History.rows
 COLUMNS = 10
+HALF_SHARE = 0.33  # half of the usual row's width, as a share of the box's
 
 
 class History:
@@ -70,14 +71,27 @@ class Scale:
 
 
 @dataclass(slots=True)
+class Body:
+    """What is known of somebody's measures: height, width of the whole box, and half the width of the usual row, m."""
+
+    height: Scale
+    width: Scale
+    half: Scale
+
+
+def usual_body(height: float, width: float, looks: float) -> Body:
+    """A body of usual measures that count for so many looks."""
+    return Body(Scale(height, looks), Scale(width, looks), Scale(HALF_SHARE * width, looks))
+
+
+@dataclass(slots=True)
 class Person:
     """A person followed: the belief of position and velocity (6,), body, looks, and what was seen so far."""
 
     id: int
     belief: Gaussian
     start: Gaussian
-    height: Scale
-    width: Scale
+    body: Body
     history: History
     t: float
     last_seen: float

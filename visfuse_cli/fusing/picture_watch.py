@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from visfuse_cli.fusing.person import Person, Scale
+from visfuse_cli.fusing.person import Body, Person, usual_body
 from visfuse_cli.fusing.settings import FuseConfig
-from visfuse_cli.fusing.sighting import expect, learn_lengths, own_sides, tracked_point
+from visfuse_cli.fusing.sighting import expect, learn_body, tracked_point
 from visfuse_cli.fusing.tracker import PRIOR_LOOKS, Newcomer, Tracker, beginning
 from visfuse_cli.records import Array, Gaussian, Image, Sighting
 from visfuse_cli.vision import silhouettes
@@ -58,7 +58,7 @@ class PictureWatch:
         """Sightings of everybody followed, by the cameras in `dt` (s), whose pictures were looked at."""
         self._dt = dt
         expected = self._expected(tracker.people)
-        return [self._sightings(expected, k, person.height, person.width) for k, person in enumerate(tracker.people)]
+        return [self._sightings(expected, k, person.body) for k, person in enumerate(tracker.people)]
 
     def newcomers(self, tracker: Tracker) -> list[Newcomer]:
         """People in what moves and belongs to nobody who is followed."""
@@ -93,16 +93,16 @@ class PictureWatch:
         return expect(
             self._P,
             _stacked([person.belief for person in people]),
-            np.array([person.height.mean for person in people]),
-            np.array([person.width.mean for person in people]),
+            np.array([person.body.height.mean for person in people]),
+            np.array([person.body.width.mean for person in people]),
             np.array([0 if person.confirmed else 1 for person in people], dtype=np.intp),
             self._config,
         )
 
-    def _sightings(self, expected: list[Expected], who: int, height: Scale, width: Scale) -> dict[int, Sighting]:
+    def _sightings(self, expected: list[Expected], who: int, body: Body) -> dict[int, Sighting]:
         """What each camera sees of one of the expected people, whose lengths are learnt."""
         found = {}
-        sigma = float(np.hypot(self._config.person.height_sigma / np.sqrt(max(height.looks / PRIOR_LOOKS, 1)), 0.03))
+        sigma = float(np.hypot(self._config.person.height_sigma / np.sqrt(max(body.height.looks / PRIOR_LOOKS, 1)), 0.03))
         for camera, dt in self._dt.items():
             there = expected[camera]
             if not (np.isfinite(there.box[who]).all() and there.depth[who] > 0):
@@ -110,19 +110,18 @@ class PictureWatch:
             seen = silhouettes.sides(self._cameras[camera].mask, there, who)
             if seen is None or seen.share < LEAST_SHARE:
                 continue
-            own = own_sides(seen, there.box[who], float(there.scale[who]))
-            measured = tracked_point(there, who, seen, own, sigma, self._config)
+            measured = tracked_point(there, who, seen, body, sigma, self._config)
             if measured is not None:
                 shown = self._cameras[camera].straight.shown(seen.box[None])[0]
                 found[camera] = Sighting(*measured, shown, dt, min(seen.share, 1.0))
-                learn_lengths(height, width, there, who, seen, own)
+                learn_body(body, there, who, seen)
         return found
 
     def _newcomer(self, place: Array, people: list[Person]) -> Newcomer | None:
         """Whoever stands near a place (2,) m, if two cameras or more agree on it and on somebody of human size."""
         person = self._config.person
-        height, width = Scale(person.height, 2.0), Scale(person.width, 2.0)
-        level = 0.0 if self._config.fusion.point == "foot" else height.mean / 2
+        body = usual_body(person.height, person.width, 2.0)
+        level = 0.0 if self._config.fusion.point == "foot" else body.height.mean / 2
         at = Gaussian(np.array([*place, level]), START_SIGMA**2 * np.eye(3))
         sightings: dict[int, Sighting] = {}
         for _ in range(ROUNDS):
@@ -131,12 +130,12 @@ class PictureWatch:
             expected = expect(
                 self._P,
                 _stacked(everybody),
-                np.array([*(other.height.mean for other in people), height.mean]),
-                np.array([*(other.width.mean for other in people), width.mean]),
+                np.array([*(other.body.height.mean for other in people), body.height.mean]),
+                np.array([*(other.body.width.mean for other in people), body.width.mean]),
                 np.array([0] * len(people) + [1], dtype=np.intp),
                 self._config,
             )
-            sightings = self._sightings(expected, len(people), height, width)
+            sightings = self._sightings(expected, len(people), body)
             cameras = sorted(sightings)
             if len(cameras) < 2:
                 return None
@@ -147,10 +146,10 @@ class PictureWatch:
             point, used = agreed
             at = Gaussian(point.mean, point.cov)
             sightings = {camera: sightings[camera] for camera, good in zip(cameras, used, strict=True) if good}
-        level = at.mean[2] - (0.0 if self._config.fusion.point == "foot" else height.mean / 2)
-        if abs(level) > FLOATING_M or not person.shortest < height.mean < person.tallest:
+        level = at.mean[2] - (0.0 if self._config.fusion.point == "foot" else body.height.mean / 2)
+        if abs(level) > FLOATING_M or not person.shortest < body.height.mean < person.tallest:
             return None
-        return Newcomer(at, sightings, height.mean)
+        return Newcomer(at, sightings, body.height.mean)
 
     def _boxes_of(self, new: Newcomer) -> dict[int, Array]:
         usual = np.array([new.height]), np.array([self._config.person.width]), np.zeros(1, dtype=np.intp)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from visfuse_cli.fusing.person import Scale
+from visfuse_cli.fusing.person import Body
 from visfuse_cli.fusing.settings import FuseConfig
 from visfuse_cli.fusing.visibility import expected_boxes
 from visfuse_cli.maths import multiview
@@ -15,7 +15,7 @@ from visfuse_cli.vision.silhouettes import Expected, Sides
 UPRIGHT_M = 0.02  # noise of head and feet, which swing less than arms
 BREADTH_M = 0.12  # how much a person's width comes and goes with the limbs
 LOST_M = 0.6  # noise along a direction in which no side was seen
-WIDER_M, TALLER = 0.4, 0.2  # what a box may differ by from the expected width (m) and height (share)
+TALLER = 0.2  # share of the expected height that a box may differ by
 LOOSE_M = 0.35  # how far from the prediction a person's pixels are looked for, at most
 WHOLE = 0.6  # share of a person that must be seen for the body's lengths to be learnt
 
@@ -42,56 +42,58 @@ def expect(
     ]
 
 
-def own_sides(seen: Sides, box: Array, scale: float) -> NDArray[np.bool_]:
-    """Which sides (left, top, right, bottom) are to be believed: with a wrong extent, not the one that is further off."""
-    own = seen.own.copy()
-    off = seen.box - box
-    for first, second, most in ((0, 2, WIDER_M * scale), (1, 3, TALLER * (box[3] - box[1]))):
-        if own[first] and own[second] and abs(off[second] - off[first]) > most:
-            own[first if abs(off[first]) > abs(off[second]) else second] = False
-    return own
-
-
 def tracked_point(
-    expected: Expected, who: int, seen: Sides, own: NDArray[np.bool_], height_sigma: float, config: FuseConfig
+    expected: Expected, who: int, seen: Sides, body: Body, height_sigma: float, config: FuseConfig
 ) -> tuple[Array, Array] | None:
     """The tracked point (2,) px and its noise (2, 2), from the sides that are the person's own; None without any."""
-    scale, off = float(expected.scale[who]), seen.box - expected.box[who]
-    sight = config.sight
+    scale, sight = float(expected.scale[who]), config.sight
     limb = float(np.hypot(sight.edge_px, sight.edge_m * scale))
     end = float(np.hypot(sight.edge_px, UPRIGHT_M * scale))
-    foot = config.fusion.point == "foot"
-    u = _shift(off[[0, 2]], own[[0, 2]], limb, BREADTH_M * scale, in_middle=True)
-    v = _shift(off[[1, 3]], own[[1, 3]], end, height_sigma * scale, in_middle=not foot)
+    u = _sideways(seen, body.half.mean * scale, limb, BREADTH_M * scale / 2)
+    v = _upright(seen, expected.box[who], end, height_sigma * scale, config.fusion.point == "foot")
     if u is None and v is None:
         return None
     unknown = (0.0, (LOST_M * scale) ** 2)
     (du, var_u), (dv, var_v) = u or unknown, v or unknown
-    return expected.point[who] + [du, dv], np.diag([var_u, var_v])
+    foot, head = expected.axis[who]
+    tilt = (head[0] - foot[0]) / min(head[1] - foot[1], -1e-6)
+    # The middle was found along rows, so that a shift upwards moves the point along the axis.
+    return expected.point[who] + [du + tilt * dv, dv], np.diag([var_u + tilt**2 * var_v, var_v])
 
 
-def _shift(
-    off: Array, own: NDArray[np.bool_], sigma: float, extent: float, in_middle: bool
-) -> tuple[float, float] | None:
-    """How far the tracked point is off the expected one, and the variance, from two opposite sides; None from none.
-
-    A side alone tells it by the expected extent, whose deviation is `extent`; else the point lies on the second side.
-    """
-    if in_middle:
-        if own.all():
-            return float(off.mean()), sigma**2 / 2
-        return (float(off[own][0]), sigma**2 + (extent / 2) ** 2) if own.any() else None
-    if own[1]:
-        return float(off[1]), sigma**2
-    return (float(off[0]), sigma**2 + extent**2) if own[0] else None
+def _sideways(seen: Sides, half: float, sigma: float, half_sigma: float) -> tuple[float, float] | None:
+    """How far the axis is off, and the variance; one side alone tells it by the usual half width, px."""
+    if np.isfinite(seen.middle):
+        return seen.middle, sigma**2 / 2
+    if np.isfinite(seen.left):
+        return half - seen.left, sigma**2 + half_sigma**2
+    if np.isfinite(seen.right):
+        return seen.right - half, sigma**2 + half_sigma**2
+    return None
 
 
-def learn_lengths(height: Scale, width: Scale, expected: Expected, who: int, seen: Sides, own: NDArray[np.bool_]) -> None:
+def _upright(seen: Sides, box: Array, sigma: float, height_sigma: float, foot: bool) -> tuple[float, float] | None:
+    """How far the tracked point is off vertically, and the variance; one end alone tells it by the usual height, px."""
+    top, bottom = float(seen.box[1] - box[1]), float(seen.box[3] - box[3])
+    ends = [seen.top, seen.bottom]
+    if all(ends) and abs(bottom - top) > TALLER * (box[3] - box[1]):
+        ends[0 if abs(top) > abs(bottom) else 1] = False  # with a wrong height one end is something else's
+    if foot:
+        if ends[1]:
+            return bottom, sigma**2
+        return (top, sigma**2 + height_sigma**2) if ends[0] else None
+    if all(ends):
+        return (top + bottom) / 2, sigma**2 / 2
+    return (top if ends[0] else bottom, sigma**2 + (height_sigma / 2) ** 2) if any(ends) else None
+
+
+def learn_body(body: Body, expected: Expected, who: int, seen: Sides) -> None:
     """Let a person's height and width follow what is seen whole."""
     if seen.share < WHOLE:
         return
     broad, tall = expected.box[who, 2:] - expected.box[who, :2]
-    if own[1] and own[3]:
-        height.learn(height.mean * float(seen.box[3] - seen.box[1]) / float(tall))
-    if own[0] and own[2]:
-        width.learn(width.mean * float(seen.box[2] - seen.box[0]) / float(broad), longest=60.0)
+    if np.isfinite(seen.middle):
+        body.half.learn((seen.left + seen.right) / 2 / float(expected.scale[who]), longest=60.0)
+        body.width.learn(body.width.mean * float(seen.box[2] - seen.box[0]) / float(broad), longest=60.0)
+    if seen.top and seen.bottom:
+        body.height.learn(body.height.mean * float(seen.box[3] - seen.box[1]) / float(tall))

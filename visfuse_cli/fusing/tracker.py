@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from visfuse_cli.fusing.estimate import Sights, at_one_time, consistent, fuse
-from visfuse_cli.fusing.person import History, Person, Scale
+from visfuse_cli.fusing.person import History, Person, usual_body
 from visfuse_cli.fusing.settings import FuseConfig
 from visfuse_cli.maths import fusion_rivals, gaussian
 from visfuse_cli.maths.assignment import gate_size
@@ -140,8 +140,7 @@ class Tracker:
                 id=self._next_id,
                 belief=belief,
                 start=belief,
-                height=Scale(new.height, PRIOR_LOOKS),
-                width=Scale(settings.width, PRIOR_LOOKS),
+                body=usual_body(new.height, settings.width, PRIOR_LOOKS),
                 history=History(len(self.P)),
                 t=t,
                 last_seen=t,

@@ -14,6 +14,7 @@ from visfuse_cli.vision.background import FOREGROUND
 SIDEWAYS_M, UPWARDS_M = 0.3, 0.25  # how far around the expected box a person's pixels are looked for
 LEAST_ROW, LEAST_COLUMN = 0.10, 0.05  # share of the width, of the height, that a side's row or column holds
 BEYOND_PX = 4  # px outside of a side that tell whether something else begins there
+LEAST_ROWS = 0.25  # share of a person's rows that must tell where its side is
 TOUCHING = 0.35  # share of a side with something else beyond it: then it is nobody's own side
 FRONT = 1.0  # lateral distance, in half widths, within which the nearer person hides the other
 CAP = 3.0  # half widths beyond which a pixel is nobody's
@@ -42,11 +43,19 @@ class Expected:
 
 @dataclass(frozen=True, slots=True)
 class Sides:
-    """What was seen of one person: box [u0, v0, u1, v1] (4,) px, which of its sides are its own, the share seen."""
+    """What was seen of one person: box [u0, v0, u1, v1] (4,) px, whether its top and bottom are its own, share seen.
+
+    Across, row by row from the expected axis, the median over rows of which a side is the person's own: `middle` px by
+    which it is off, `left` and `right` px that it reaches; NaN where too few rows tell.
+    """
 
     box: Array
-    own: NDArray[np.bool_]
+    top: bool
+    bottom: bool
     share: float
+    middle: float
+    left: float
+    right: float
 
 
 def moving(labels: Image) -> Image:
@@ -73,13 +82,56 @@ def sides(mask: Image, expected: Expected, who: int) -> Sides | None:
     down = np.flatnonzero(rows >= max(2.0, LEAST_ROW * broad))
     if len(across) < 2 or len(down) < 3:
         return None
-    u0, u1, v0, v1 = across[0], across[-1] + 1, down[0], down[-1] + 1
-    share = float(own.sum()) / max(0.55 * tall * broad, 1.0)
+    u0, u1, v0, v1 = int(across[0]), int(across[-1]) + 1, int(down[0]), int(down[-1]) + 1
     found = np.array([left + u0, top + v0, left + u1, top + v1]) - 0.5  # a pixel reaches half of one to each side
-    kept = ~_beyond(part, own, (u0, v0, u1, v1))
-    kept &= np.array([left + u0 > 1, top + v0 > 1, left + u1 < wide - 1, top + v1 < high - 1])
-    kept &= np.array([u0 > 0 or left == 0, v0 > 0 or top == 0, u1 < right - left, v1 < bottom - top])
-    return Sides(found, kept, share)
+    other = part.astype(bool) & ~own
+    return Sides(
+        found,
+        bool(top + v0 > 1 and (v0 > 0 or top == 0) and not _touched(own, other, v0, -1)),
+        bool(top + v1 < high - 1 and v1 < bottom - top and not _touched(own, other, v1, 1)),
+        float(own.sum()) / max(0.55 * tall * broad, 1.0),
+        *_across(own, other, down, expected.axis[who] - [left, top], left == 0),
+    )
+
+
+def _across(
+    own: NDArray[np.bool_],
+    other: NDArray[np.bool_],
+    rows: NDArray[np.intp],
+    axis: Array,
+    at_border: bool,
+) -> tuple[float, float, float]:
+    """Offset of the middle, and reach to the left and to the right, from the axis (2, 2) px over `rows` of a window."""
+    foot, head = axis
+    own, other = own[rows], other[rows]
+    wide = own.shape[1]
+    first, last = own.argmax(axis=1), wide - 1 - own[:, ::-1].argmax(axis=1)
+    u = foot[0] + (rows - foot[1]) * (head[0] - foot[0]) / min(head[1] - foot[1], -1e-6)
+    near = np.arange(wide)[None]
+    free = (
+        ~np.any(other & (near < first[:, None]) & (near >= first[:, None] - BEYOND_PX), axis=1),
+        ~np.any(other & (near > last[:, None]) & (near <= last[:, None] + BEYOND_PX), axis=1),
+    )
+    free = (free[0] & (first > (1 if at_border else 0)), free[1] & (last < wide - 1))
+    reach_left, reach_right = u - first + 0.5, last - u + 0.5
+    least = max(3, LEAST_ROWS * len(rows))
+
+    def middle_of(values: Array, told: NDArray[np.bool_]) -> float:
+        return float(np.median(values[told])) if np.count_nonzero(told) >= least else np.nan
+
+    return (
+        middle_of((reach_right - reach_left) / 2, free[0] & free[1]),
+        middle_of(reach_left, free[0]),
+        middle_of(reach_right, free[1]),
+    )
+
+
+def _touched(own: NDArray[np.bool_], other: NDArray[np.bool_], row: int, way: int) -> bool:
+    """Whether something else moves beyond (`way` -1: above, 1: below) an owned box that ends at a row."""
+    inner = slice(row, row + BEYOND_PX) if way < 0 else slice(max(row - BEYOND_PX, 0), row)
+    outer = slice(max(row - BEYOND_PX, 0), row + BEYOND_PX)
+    at_side = own[inner].any(axis=0)
+    return bool((at_side & other[outer].any(axis=0)).sum() > TOUCHING * max(int(at_side.sum()), 1))
 
 
 def _owned(expected: Expected, who: int, window: tuple[int, int, int, int]) -> NDArray[np.bool_]:
@@ -110,21 +162,3 @@ def _distance(expected: Expected, who: int, u: NDArray[np.intp], v: NDArray[np.i
     du, dv = u[None, :] - foot[0], v[:, None] - foot[1]
     share = np.clip((du * along[0] + dv * along[1]) / length, 0.05, 0.95)
     return np.asarray(np.hypot(du - share * along[0], dv - share * along[1]) / expected.half_width[who])
-
-
-def _beyond(part: Image, own: NDArray[np.bool_], box: tuple[int, int, int, int]) -> NDArray[np.bool_]:
-    """Beyond which sides (left, top, right, bottom) of an owned box something else moves."""
-    u0, v0, u1, v1 = box
-    other = part.astype(bool) & ~own
-    strips = (
-        (own[v0:v1, u0 : u0 + BEYOND_PX], other[v0:v1, max(u0 - BEYOND_PX, 0) : u0 + BEYOND_PX], 1),
-        (own[v0 : v0 + BEYOND_PX, u0:u1], other[max(v0 - BEYOND_PX, 0) : v0 + BEYOND_PX, u0:u1], 0),
-        (own[v0:v1, u1 - BEYOND_PX : u1], other[v0:v1, u1 - BEYOND_PX : u1 + BEYOND_PX], 1),
-        (own[v1 - BEYOND_PX : v1, u0:u1], other[v1 - BEYOND_PX : v1 + BEYOND_PX, u0:u1], 0),
-    )
-    touched = []
-    for mine, theirs, axis in strips:
-        at_side = mine.any(axis=axis)
-        count = max(int(at_side.sum()), 1)
-        touched.append((at_side & theirs.any(axis=axis)).sum() / count > TOUCHING)
-    return np.array(touched)
