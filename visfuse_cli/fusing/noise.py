@@ -16,8 +16,8 @@ USUAL = 3.0  # times the nominal variance: what limbs, clothes and light add ove
 LIMITS = (0.3, 100.0)
 POOR = 4.0  # times a camera's usual variance: where a side was hidden, what is left says little about noise
 THIN_S = 0.25  # s between looks that do not share a step of the person's
-GRID = np.array([0.12, 0.2, 0.33, 0.55, 0.9, 1.5, 2.5])  # m/s^2 per root Hz
-GRID_SIGMA = 0.8  # of the logarithm of how hard people turn, before anything is known of one
+GRID = np.array([0.05, 0.08, 0.13, 0.21, 0.34, 0.55, 0.9, 1.5, 2.5])  # m/s^2 per root Hz
+GRID_SIGMA = 1.5  # of the logarithm of how hard people turn, before anything is known of one
 
 
 def disagreement(sights: Sights, residual: Array, t: Array) -> tuple[float, float]:
