@@ -154,7 +154,7 @@ def _track(
         with run_.stage("fuse"):
             tracker.update(frame, sightings)
             inside, clear = visibility(tracker.beliefs, eyes.sizes, eyes.P, config)
-            tracker.miss(clear & eyes.open)
+            tracker.miss(clear & eyes.open, sightings)
             ended = tracker.end(instant.t, np.count_nonzero(inside, axis=1))
         with run_.stage("newcomers"):
             tracker.begin(frame, instant.t, eyes.newcomers(tracker))

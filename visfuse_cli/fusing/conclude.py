@@ -19,7 +19,7 @@ from visfuse_cli.maths.smoothing import rauch_tung_striebel
 from visfuse_cli.records import Array, Gaussian
 
 DENIED = 1  # camera or more with a clear sight that speak against a prediction
-BODY_SIGMA = 0.002  # m, times the root of the noise found: what cameras err alike, as by feet that point ahead
+BODY_SIGMA = 0.0035  # m, times the root of the noise found: what cameras err alike, as by feet that point ahead
 START_DOUBT = 2.0  # times the deviations a track began with
 
 

@@ -12,8 +12,8 @@ from visfuse_cli.records import Array, Gaussian
 
 BATCH_S = 0.75  # s over which errors are summed: longer than a step, and than what the smoother looks around
 PRIOR_BATCHES = 6.0  # batches that the usual noise counts for
-USUAL = 3.0  # times the nominal variance: what limbs, clothes and light add over the length of a batch
-LIMITS = (0.3, 100.0)
+USUAL = 1.0  # times the nominal variance
+LIMITS = (0.05, 100.0)
 POOR = 4.0  # times a camera's usual variance: where a side was hidden, what is left says little about noise
 THIN_S = 0.25  # s between looks that do not share a step of the person's
 GRID = np.array([0.05, 0.08, 0.13, 0.21, 0.34, 0.55, 0.9, 1.5, 2.5])  # m/s^2 per root Hz

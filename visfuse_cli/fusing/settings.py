@@ -47,8 +47,8 @@ class SightSettings(Section):
     pixels: int = Field(
         400_000, ge=10_000, le=50_000_000, description="px: larger pictures are looked at in a smaller copy"
     )
-    edge_px: float = Field(0.8, gt=0, le=50, description="px: noise of a box's side")
-    edge_m: float = Field(0.035, ge=0, le=1, description="m: what swinging limbs and clothes add to it")
+    edge_px: float = Field(1.2, gt=0, le=50, description="px: noise of a box's side")
+    edge_m: float = Field(0.06, ge=0, le=1, description="m: what swinging limbs and clothes add to it")
     box_share: float = Field(
         0.03, gt=0, le=1, description="noise of a side of an external box, as a share of the box's height"
     )

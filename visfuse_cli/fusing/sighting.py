@@ -12,7 +12,7 @@ from visfuse_cli.maths import multiview
 from visfuse_cli.records import Array, Gaussian
 from visfuse_cli.vision.silhouettes import Expected, Sides
 
-UPRIGHT_M = 0.02  # noise of head and feet, which swing less than arms
+UPRIGHT_M = 0.04  # noise of head and feet, which swing less than arms
 BREADTH_M = 0.12  # how much a person's width comes and goes with the limbs
 LOST_M = 0.6  # noise along a direction in which no side was seen
 TALLER = 0.2  # share of the expected height that a box may differ by

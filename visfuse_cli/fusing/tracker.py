@@ -151,10 +151,10 @@ class Tracker:
             self._remember(person, frame, new.sightings)
             self.people.append(person)
 
-    def miss(self, clear: NDArray[np.bool_]) -> None:
-        """Take note of who was not seen though cameras had a clear sight of the place (T, C)."""
-        for person, open_sights in zip(self.people, clear, strict=True):
-            if not person.last:
+    def miss(self, clear: NDArray[np.bool_], sightings: list[dict[int, Sighting]]) -> None:
+        """Take note of who was not seen, not even doubtfully, though cameras had a clear sight of the place (T, C)."""
+        for person, open_sights, seen in zip(self.people, clear, sightings, strict=True):
+            if not seen:
                 person.history.denied[-1] = int(np.count_nonzero(open_sights))
                 person.missed += person.history.denied[-1]
 

@@ -23,7 +23,7 @@ def linear(P: Array, z: Array) -> Array:
     """
     rows = z[..., None] * P[..., 2:, :] - P[..., :2, :]
     rows = rows / np.linalg.norm(rows[..., :3], axis=-1, keepdims=True)
-    A = rows.reshape(*rows.shape[:-3], -1, 4)
+    A = rows.reshape(*rows.shape[:-3], 2 * rows.shape[-3], 4)
     good = np.isfinite(A).all(axis=(-2, -1))
     h = np.linalg.svd(np.where(good[..., None, None], A, 0.0), full_matrices=False)[2][..., -1, :]
     w = h[..., 3:]
