@@ -5,13 +5,17 @@ sets of frames -> sightings of everybody followed -> closed-loop fusion -> newco
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import ExitStack
 from dataclasses import dataclass, field
+from itertools import tee
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from visfuse_cli.errors import InputError, UsageError
+from visfuse_cli.files.images import write_image
 from visfuse_cli.files.multi_calibration import read_views
 from visfuse_cli.files.multi_scene import Footage, find_footage
 from visfuse_cli.files.run_json import write_run_json
@@ -19,6 +23,8 @@ from visfuse_cli.files.runfolder import RunFolder
 from visfuse_cli.files.scene import check_scene
 from visfuse_cli.files.spool import TrackSpool
 from visfuse_cli.files.video import VideoSource, describe
+from visfuse_cli.files.video_writer import VideoWriter
+from visfuse_cli.fusing.annotate import Drawn, GroundPlan, active, draw_view, mosaic, mosaic_size
 from visfuse_cli.fusing.conclude import Path as Settled
 from visfuse_cli.fusing.conclude import conclude
 from visfuse_cli.fusing.eyes import BoxEyes, Eyes, PictureEyes
@@ -55,6 +61,7 @@ class _Results:
     """What a run has found so far."""
 
     begun: list[tuple[int, int]] = field(default_factory=list)  # first frame, id
+    extent: Array = field(default_factory=lambda: np.zeros((0, 2)))  # corners of where people were, m
     rejected: dict[str, int] = field(default_factory=dict)
 
 
@@ -76,6 +83,9 @@ def run(request: RunRequest) -> RunResult:
         for audit in audits.values():
             for warning in audit.warnings:
                 run_.warn(warning)
+        write_image(folder / "map.png", _plan(scene, results).whole(_drawn(scene, config, spool, results)))
+        if request.video and run_.stopped_by is None and all(each.video for each in scene.footage):
+            _annotate(scene, offsets, folder, request, run_, spool, results)
         summary = _summary(scene, run_, results, folder)
         write_run_json(
             folder / "run.json",
@@ -141,8 +151,7 @@ def _track(
     with run_.stage("warm up"):
         eyes = _eyes(scene, sources, config)
     tracker = Tracker(eyes.P, config)
-    tolerance = 0.55 / min(source.nominal_rate for source in sources.values())
-    for instant in run_.synchronise(sources, tolerance, offsets):
+    for instant in run_.synchronise(sources, _tolerance(sources), offsets):
         run_.count("sets of frames")
         frame = instant.frames[scene.names[0]].index
         with run_.stage("detect"):
@@ -186,7 +195,58 @@ def _settle(
             continue
         spool.add(track_record(path, scene.names, scene.R, scene.t))
         results.begun.append((int(path.frame[0]), path.id))
+        places = np.concatenate([results.extent, path.belief.mean[:, :2]])
+        results.extent = np.stack([places.min(axis=0), places.max(axis=0)])
         run_.count("people")
+
+
+def _plan(scene: _Scene, results: _Results) -> GroundPlan:
+    return GroundPlan(scene.views, results.extent)
+
+
+def _drawn(scene: _Scene, config: FuseConfig, spool: TrackSpool, results: _Results) -> Iterator[Drawn]:
+    """The settled tracks in the order of their first frames."""
+    centroid = config.fusion.point == "centroid"
+    for _, identity in sorted(results.begun):
+        yield Drawn(spool.read(identity), scene.R, scene.t, config.display.units, centroid)
+
+
+def _annotate(
+    scene: _Scene,
+    offsets: dict[str, float],
+    folder: Path,
+    request: RunRequest,
+    run_: Run,
+    spool: TrackSpool,
+    results: _Results,
+) -> None:
+    """Write each camera's annotated video and the mosaic from a second decode."""
+    sources = _open(scene, request)
+    plan = _plan(scene, results)
+    with ExitStack() as stack:
+        rate = next(iter(sources.values())).nominal_rate
+        sinks = {}
+        for name, source in sources.items():
+            writer = VideoWriter(folder / f"annotated-{name}.mp4", source.width, source.height, source.nominal_rate)
+            sinks[name] = stack.enter_context(run_.background(stack.enter_context(writer)))
+        writer = VideoWriter(folder / "mosaic.mp4", *mosaic_size(scene.views), rate)
+        whole = stack.enter_context(run_.background(stack.enter_context(writer)))
+        instants, again = tee(run_.synchronise(sources, _tolerance(sources), offsets))
+        frames = (instant.frames[scene.names[0]].index for instant in again)
+        drawn = _drawn(scene, request.config, spool, results)
+        for people, instant in zip(active(drawn, frames), instants, strict=True):
+            for view in scene.views:
+                frame = instant.frames.get(view.name)
+                if frame is not None:
+                    draw_view(frame.image, view, people, instant.t)
+                    sinks[view.name].write(frame.image, frame.t)
+            pictures = {name: frame.image for name, frame in instant.frames.items()}
+            whole.write(mosaic(scene.views, pictures, plan.now(people)), instant.t)
+
+
+def _tolerance(sources: dict[str, VideoSource]) -> float:
+    """How far (s) a frame may be from the instant of its set: half of the longest interval, and a little."""
+    return 0.55 / min(source.nominal_rate for source in sources.values())
 
 
 def _summary(scene: _Scene, run_: Run, results: _Results, folder: Path) -> dict[str, Any]:

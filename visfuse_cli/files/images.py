@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 
 from visfuse_cli.errors import InputError
+from visfuse_cli.files.atomic import replacing
 from visfuse_cli.files.folders import IMAGE_SUFFIXES, list_files
 from visfuse_cli.files.timing import TimeAuditor
 from visfuse_cli.records import Image
@@ -84,6 +85,12 @@ class ImageFolder:
         samples = (_load(self.names[k]) for k in chosen)
         brightest = max(int(image.max()) for image in samples if image is not None)
         return 255 / (2 ** max(brightest.bit_length(), 8) - 1)
+
+
+def write_image(path: Path, image: Image) -> None:
+    """Write a picture (H, W, 3) BGR as PNG; raises OutputError where it cannot be written."""
+    with replacing(path) as file:
+        file.write(cv2.imencode(".png", image)[1].tobytes())
 
 
 def _load(name: Path) -> np.ndarray | None:
