@@ -17,6 +17,7 @@ from visfuse_cli import __version__
 from visfuse_cli.files.atomic import write_text
 from visfuse_cli.maths.percentiles import pace, percentile
 from visfuse_cli.maths.speed import KMH
+from visfuse_cli.records import Array
 from visfuse_cli.report import plots
 from visfuse_cli.report.folder import RunView, TrackView, read
 
@@ -152,7 +153,8 @@ def _consistency(tracks: list[TrackView]) -> str:
     told = [(s["nis_mean"], s["n_frames"], s["nis_dof"]) for s in summaries if s.get("nis_mean") and s.get("nis_dof")]
     if not told:
         return ""
-    mean, count, size = (np.array(column, dtype=float) for column in zip(*told, strict=True))
+    table: Array = np.array(told, dtype=float)
+    mean, count, size = table[:, 0], table[:, 1], table[:, 2]
     freedom = float((count * size).sum())
     ratio = float((mean * count).sum()) / freedom
     low, high = chi2.ppf([0.0005, 0.9995], freedom) / freedom
