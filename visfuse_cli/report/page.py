@@ -157,7 +157,7 @@ def _consistency(tracks: list[TrackView]) -> str:
     mean, count, size = table[:, 0], table[:, 1], table[:, 2]
     freedom = float((count * size).sum())
     ratio = float((mean * count).sum()) / freedom
-    low, high = chi2.ppf([0.0005, 0.9995], freedom) / freedom
+    low, high = (float(chi2.ppf(share, freedom)) / freedom for share in (0.0005, 0.9995))
     verdict = "consistent" if low <= ratio <= high else ("cautious" if ratio < low else "too sure of itself")
     return (
         f"normalised innovation squared {ratio:.2f} per degree of freedom (99.9 % band {low:.2f}-{high:.2f}): {verdict}"
