@@ -40,7 +40,7 @@ SetOption = Annotated[
 OutOption = Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for the results.")]
 OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="Replace the results of an earlier run in DIR.")]
 NoVideoOption = Annotated[bool, typer.Option("--no-video", help="Write no annotated video.")]
-NoReportOption = Annotated[bool, typer.Option("--no-report", help="Write no report.html (this version writes none).")]
+NoReportOption = Annotated[bool, typer.Option("--no-report", help="Write no report.html.")]
 StartOption = Annotated[float | None, typer.Option("--start", metavar="S", help="Begin at this second of the footage.")]
 EndOption = Annotated[float | None, typer.Option("--end", metavar="S", help="End at this second of the footage.")]
 SeedOption = Annotated[int, typer.Option("--seed", min=0, help="Seed of everything random.")]
@@ -186,7 +186,26 @@ def speed(
     elif new_only:
         raise UsageError("--new-only needs --log: the log is what tells which clips are new")
     else:
-        _report(command.run(request), as_json, quiet, command.text)
+        _report(_with_page(command.run(request), request.report), as_json, quiet, command.text)
+
+
+@app.command("report")
+def report(
+    runs: Annotated[list[Path], typer.Argument(metavar="RUN...", help="Folders that tracking commands wrote.")],
+    out: Annotated[
+        Path | None, typer.Option("--out", metavar="FILE", help="The page; default: report.html in the one RUN.")
+    ] = None,
+    quiet: QuietOption = False,
+) -> None:
+    """One HTML page about one or several runs: video, map, tables, figures; it opens from disk, without a network.
+
+    Example: visfuse report run
+    """
+    from visfuse_cli.report import write
+
+    page = write(runs, out)
+    if not (quiet or _quiet):
+        typer.echo(f"{'report':<12} {page}")
 
 
 @app.command("summary")
@@ -292,7 +311,7 @@ def demo(
     from visfuse_cli.apps import demo as command
 
     result = command.run(out, overwrite=overwrite, progress=not (no_progress or quiet or _quiet), argv=tuple(sys.argv))
-    _report(result, as_json, quiet, command.text)
+    _report(_with_page(result, True), as_json, quiet, command.text)
 
 
 @config_app.command("show")
@@ -352,6 +371,15 @@ def _size(text: str | None) -> tuple[int, int] | None:
     if not (separator and width.isdigit() and height.isdigit() and int(width) and int(height)):
         raise UsageError(f"--size {text}: write it as WIDTHxHEIGHT, like 1280x720")
     return int(width), int(height)
+
+
+def _with_page(result: RunResult, wanted: bool) -> RunResult:
+    """The result, with report.html in its folder if it is wanted."""
+    if wanted:
+        from visfuse_cli.report import write
+
+        write([result.out])
+    return result
 
 
 def _report(result: RunResult, as_json: bool, quiet: bool, text: Any) -> None:

@@ -58,5 +58,6 @@ def text(result: RunResult) -> str:
         f"{speed.text(result)}\n\n"
         f"calibration  {result.out.parent / 'H.json'} (picture: H.png)\n"
         f"video        {result.out / 'annotated.mp4'}\n"
-        f"table        {result.out / 'speeds.csv'}"
+        f"table        {result.out / 'speeds.csv'}\n"
+        f"report       {result.out / 'report.html'}"
     )

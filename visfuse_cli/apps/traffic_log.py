@@ -10,6 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from visfuse_cli import report
 from visfuse_cli.commands import speed
 from visfuse_cli.errors import InputError, UsageError
 from visfuse_cli.files.folders import describe, is_folder, list_clips
@@ -31,6 +32,8 @@ def run(request: RunRequest, log: Path, new_only: bool = False) -> RunResult:
         result = speed.run(request)
         if result.stopped_by is None:
             _append(request.out, held, _settings(request))
+    if request.report:
+        report.write([request.out])
     return result
 
 
@@ -57,6 +60,8 @@ def _run_new(request: RunRequest, log: Path) -> RunResult:
             if done[-1].stopped_by is not None:
                 break
             _append(own.out, held, settings)
+            if request.report:
+                report.write([own.out])
     if unreadable:
         others = f"; {len(unreadable) - 1} more like it" if len(unreadable) > 1 else ""
         raise InputError(f"{unreadable[0]}{others}; the other clips are in the log")

@@ -18,6 +18,7 @@ from visfuse_cli.config import Section
 from visfuse_cli.errors import InputError
 from visfuse_cli.files import detections as detection_files
 from visfuse_cli.files import homography as homography_files
+from visfuse_cli.files.atomic import replacing
 from visfuse_cli.files.run_json import write_run_json
 from visfuse_cli.files.runfolder import RunFolder
 from visfuse_cli.files.spool import TrackSpool, write_table
@@ -149,6 +150,7 @@ def run(request: RunRequest) -> RunResult:
                 if path.name in results.drawn:
                     name = f"annotated-{path.stem}.mp4" if several else "annotated.mp4"
                     _annotate(path, folder / name, ground, request, run_, spool, results)
+        _keep_calibration_picture(request.options["homography"], folder)
         summary = _summary(results, run_, config, folder)
         write_run_json(
             folder / "run.json",
@@ -313,6 +315,14 @@ def _annotate(
         ):
             for frame in annotate(run_.frames(source), records, camera, units, watch):
                 sink.write(frame.image, frame.t)
+
+
+def _keep_calibration_picture(homography: Path, folder: Path) -> None:
+    """Lay the picture that the calibration drew beside its homography, if it did, with the results."""
+    picture = homography.with_suffix(".png")
+    if picture.is_file():
+        with replacing(folder / "calibration.png") as file:
+            file.write(picture.read_bytes())
 
 
 def _summary(results: _Results, run_: Run, config: SpeedConfig, folder: Path) -> dict[str, Any]:

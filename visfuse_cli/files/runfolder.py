@@ -12,8 +12,10 @@ from visfuse_cli.files.atomic import PARTIAL_PREFIX, PARTIAL_SUFFIX, failing_as_
 
 LOCK = ".visfuse.lock"
 TRACKS_PARTIAL = ".tracks.partial.jsonl"
-RESULTS = ("tracks.json", "speeds.csv", "rejected.csv", "run.json", "report.html", "evaluation.json", "annotated*.mp4")
-RESULTS += ("mosaic.mp4", "map.png")
+RESULTS = (
+    *("tracks.json", "speeds.csv", "rejected.csv", "run.json", "report.html", "evaluation.json"),
+    *("calibration.png", "map.png", "mosaic.mp4", "annotated*.mp4"),
+)
 LEFTOVERS = (TRACKS_PARTIAL, f"{PARTIAL_PREFIX}*{PARTIAL_SUFFIX}")  # of a run that was killed
 
 

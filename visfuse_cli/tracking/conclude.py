@@ -49,6 +49,7 @@ class Path:
     calibration: Array
     pixel: Array
     nis: Array
+    nis_dof: int  # numbers in a measurement
     refused: int
     likeness: float  # mean share of the outline that was found
     misfit_px: float
@@ -98,6 +99,7 @@ def conclude(track: Track, camera: GroundCamera, settings: TrackerSettings, dyna
         calibration=calibration,
         pixel=pixel,
         nis=nis,
+        nis_dof=len(dynamics.H),
         refused=track.refused,
         likeness=float(np.nanmean([s.border for s in samples if s.measured])),
         misfit_px=misfit,

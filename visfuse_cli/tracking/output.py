@@ -95,6 +95,7 @@ def _summary(path: Path, verdict: Verdict) -> dict[str, Any]:
         "direction": _degrees(verdict.course),
         "size": path.size.tolist(),
         "nis_mean": float(nis.mean()) if len(nis) else None,
+        "nis_dof": path.nis_dof,
         "ended": path.ended_by,
         "rejected": verdict.reason or None,
     }

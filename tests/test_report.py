@@ -1,0 +1,121 @@
+"""The report: everything a run folder holds, on one page that needs no network."""
+
+import json
+import re
+import subprocess
+import sys
+from html.parser import HTMLParser
+from importlib import resources
+from pathlib import Path
+
+import pytest
+
+from visfuse_cli import report
+from visfuse_cli.errors import InputError
+from visfuse_cli.files.spool import TrackSpool
+
+SAMPLE = Path(str(resources.files("visfuse_cli.apps.sample")))
+
+
+def _visfuse(*args):
+    command = [sys.executable, "-m", "visfuse_cli", *map(str, args)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=120)
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("report")
+    H = folder / "H.json"
+    _visfuse("calibrate-homography", "--points", SAMPLE / "points.csv", "--image", SAMPLE / "clip.mp4", "--out", H)
+    done = _visfuse("speed", SAMPLE / "clip.mp4", "--homography", H, "--out", folder / "run", "--end", 5)
+    assert done.returncode == 0, done.stderr
+    return folder / "run"
+
+
+class _Page(HTMLParser):
+    def __init__(self):
+        super().__init__()
+        self.sources, self.rows, self.open = [], 0, []
+
+    def handle_starttag(self, tag, attributes):
+        values = dict(attributes)
+        self.sources += [values[name] for name in ("src", "href") if name in values]
+        self.rows += tag == "tr" and "data-seek" in values
+        if tag in ("section", "table", "video", "script", "style"):
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        if tag in ("section", "table", "video", "script", "style"):
+            assert self.open.pop() == tag
+
+
+def _page(path):
+    page = _Page()
+    page.feed(path.read_text(encoding="utf-8"))
+    assert page.open == []
+    return page
+
+
+def test_a_run_ends_with_a_page_that_needs_nothing_else(run):
+    page = _page(run / "report.html")
+    assert page.rows >= 2
+    assert all(source.startswith("data:") for source in page.sources), "something is loaded from elsewhere"
+    text = (run / "report.html").read_text(encoding="utf-8")
+    assert text.count("<svg") == 2
+    assert "data:video/mp4" in text
+    assert "data:image/png" in text  # the calibration's picture
+    for word in ("50th percentile", "Rejected", "normalised innovation squared", "How it was made"):
+        assert word in text
+    tracks = json.loads(re.search(r'class="tracks">(.*?)</script>', text, re.DOTALL)[1])
+    assert {track["id"] for track in tracks} == {
+        t["id"] for t in json.loads((run / "tracks.json").read_text())["tracks"]
+    }
+
+
+def test_the_same_run_makes_the_same_page(run, tmp_path):
+    first = report.write([run], tmp_path / "a.html").read_bytes()
+    assert first == report.write([run], tmp_path / "b.html").read_bytes()
+
+
+def test_several_runs_share_a_page(run, tmp_path):
+    done = _visfuse("report", run, run, "--out", tmp_path / "both.html")
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "both.html").read_text(encoding="utf-8").count("<section") == 2
+
+
+def test_a_run_of_a_moving_camera_has_a_page(tmp_path):
+    """Tracks in 3D without tables or video, with several motion models."""
+    states = [
+        {
+            "frame": k,
+            "t": k / 10,
+            "position": [0.1 * k, 0.0, 5.0 + 0.2 * k],
+            "velocity": [1.0, 0.0, 2.0],
+            "speed": 2.2,
+            "speed_sigma": 0.1,
+            "measured": True,
+            "models": {"cv": 0.7, "ca": 0.3},
+        }
+        for k in range(30)
+    ]
+    summary = {"t_start": 0.0, "t_end": 2.9, "n_frames": 30, "distance": 6.5, "speed": 2.2, "speed_ci95": [2.1, 2.3]}
+    with TrackSpool(tmp_path, "track-imm", 0, "left-camera-at-start") as tracks:
+        tracks.add({"id": 1, "summary": summary, "states": states})
+    document = {
+        **{"command": "track-imm", "version": "1", "finished": "now", "seed": 0, "stopped_by": None},
+        **{"command_line": [], "inputs": [], "versions": {}, "warnings": ["</script><b>"], "time_audit": {}},
+    }
+    (tmp_path / "run.json").write_text(json.dumps(document))
+    text = report.write([tmp_path]).read_text(encoding="utf-8")
+    assert "Motion models of track 1" in text
+    assert "</script><b>" not in text
+    assert _page(tmp_path / "report.html").rows == 1
+
+
+def test_what_is_no_run_is_refused(tmp_path):
+    with pytest.raises(InputError, match="not a run folder"):
+        report.write([tmp_path])
+    (tmp_path / "run.json").write_text("[]")
+    with pytest.raises(InputError, match="holds one JSON object"):
+        report.write([tmp_path])
+    assert not (tmp_path / "report.html").exists()

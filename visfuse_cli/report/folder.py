@@ -1,0 +1,109 @@
+"""What a run folder holds, read for the report: every file is optional but run.json."""
+
+from __future__ import annotations
+
+import csv
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from visfuse_cli.errors import InputError
+from visfuse_cli.records import Array
+
+
+@dataclass(frozen=True, slots=True)
+class TrackView:
+    """One track as the report shows it: t (T,) s, position (T, 2 or 3) m, speed and its deviation (T,) m/s."""
+
+    id: int
+    clip: str
+    summary: dict[str, Any]
+    t: Array
+    position: Array
+    speed: Array
+    speed_sigma: Array
+    measured: Array
+    models: dict[str, Array]
+
+
+@dataclass(frozen=True, slots=True)
+class RunView:
+    """One run: its document, tracks, tables, videos by clip or view, and the calibration picture if there is one."""
+
+    folder: Path
+    document: dict[str, Any]
+    frame_of_reference: str
+    tracks: list[TrackView]
+    rows: list[dict[str, str]]
+    rejected: list[dict[str, str]]
+    videos: dict[str, Path]
+    calibration: Path | None
+
+
+def read(folder: Path) -> RunView:
+    """Read a run folder; raises InputError where it is none, or a file in it is damaged."""
+    if not (folder / "run.json").is_file():
+        raise InputError(f"{folder}: not a run folder: it has no run.json")
+    document = _json(folder / "run.json")
+    tracks = _json(folder / "tracks.json") if (folder / "tracks.json").is_file() else {"tracks": []}
+    try:
+        views = [_track(track) for track in tracks["tracks"]]
+    except (KeyError, TypeError, ValueError) as problem:
+        raise InputError(f"{folder / 'tracks.json'}: not the tracks of a run: {problem!r}") from problem
+    picture = folder / "calibration.png"
+    return RunView(
+        folder=folder,
+        document=document,
+        frame_of_reference=str(tracks.get("frame_of_reference", "")),
+        tracks=views,
+        rows=_table(folder / "speeds.csv"),
+        rejected=_table(folder / "rejected.csv"),
+        videos=_videos(folder),
+        calibration=picture if picture.is_file() else None,
+    )
+
+
+def _json(path: Path) -> dict[str, Any]:
+    try:
+        document = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as problem:
+        raise InputError(f"{path}: cannot be read: {problem}") from problem
+    if not isinstance(document, dict):
+        raise InputError(f"{path}: not the file of a run; it holds one JSON object")
+    return document
+
+
+def _table(path: Path) -> list[dict[str, str]]:
+    if not path.is_file():
+        return []
+    try:
+        with open(path, newline="", encoding="utf-8") as file:
+            return list(csv.DictReader(file))
+    except (OSError, ValueError, csv.Error) as problem:
+        raise InputError(f"{path}: cannot be read: {problem}") from problem
+
+
+def _track(track: dict[str, Any]) -> TrackView:
+    states = track["states"]
+    column = lambda key, default: np.array([state.get(key, default) for state in states], dtype=float)  # noqa: E731
+    names = sorted({name for state in states for name in state.get("models", {})})
+    return TrackView(
+        id=int(track["id"]),
+        clip=str(track.get("clip", "")),
+        summary=track["summary"],
+        t=column("t", np.nan),
+        position=np.array([state["position"] for state in states], dtype=float),
+        speed=column("speed", np.nan),
+        speed_sigma=column("speed_sigma", np.nan),
+        measured=column("measured", True),
+        models={name: np.array([state.get("models", {}).get(name, 0.0) for state in states]) for name in names},
+    )
+
+
+def _videos(folder: Path) -> dict[str, Path]:
+    """Annotated videos by what follows `annotated-`; a single one is called nothing."""
+    found = sorted(folder.glob("annotated*.mp4"))
+    return {path.stem.removeprefix("annotated").removeprefix("-"): path for path in found}
