@@ -1,4 +1,4 @@
-"""People in a yard before several cameras: jointed bodies on smooth walks, with everything exact that a test asks for."""
+"""People in a yard before several cameras: jointed bodies on smooth walks, with all that a test asks for exact."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ class Walker:
         hip, shoulder = 0.5 * h, 0.8 * h
         parts = [
             Part(at(0, 0, hip), at(0, 0, shoulder - 0.02 * h), 0.09 * h, 0.1 * h, self.shirt),
-            Part(at(0, 0.05 * h, shoulder - 0.01 * h), at(0, -0.05 * h, shoulder - 0.01 * h), 0.06 * h, 0.06 * h, self.shirt),
+            Part(at(0, 0.05 * h, 0.79 * h), at(0, -0.05 * h, 0.79 * h), 0.06 * h, 0.06 * h, self.shirt),
             Part(at(0, 0, 0.935 * h), at(0, 0, 0.925 * h), 0.065 * h, 0.065 * h, self.skin),
         ]
         for side in (1.0, -1.0):
@@ -155,10 +155,11 @@ def _walkers(rng: np.random.Generator, people: int, seconds: float, stand_s: flo
         times, knots = [stand_s, meet, out, seconds], [start, middle, end, back]
         if stand_s > 0:
             times, knots = [0.0, *times], [start, *knots]
-        clothes = [_colour(hues[number], 0.75, rng.uniform(0.5, 0.9)), _colour(rng.uniform(), 0.4, rng.uniform(0.2, 0.6))]
+        shirt = _colour(hues[number], 0.75, rng.uniform(0.5, 0.9))
+        trousers = _colour(rng.uniform(), 0.4, rng.uniform(0.2, 0.6))
         height = float(np.clip(rng.normal(1.75, 0.07), 1.5, 2.0))
         walker = Walker(
-            number + 1, height, (150, 175, 215), clothes[0], clothes[1], np.array(times), np.array(knots, dtype=float)
+            number + 1, height, (150, 175, 215), shirt, trousers, np.array(times), np.array(knots, dtype=float)
         )
         if _clear(walker, walkers, seconds):
             walkers.append(walker)

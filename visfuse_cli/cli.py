@@ -253,7 +253,7 @@ def summary(
 @app.command("fuse-cameras")
 def fuse_cameras(
     scene: Annotated[
-        Path, typer.Argument(metavar="SCENE", help="A folder: calibration.toml and the footage (or boxes) of each camera.")
+        Path, typer.Argument(metavar="SCENE", help="A folder: calibration.toml, and footage or boxes of each camera.")
     ],
     out: OutOption,
     estimate_offsets: Annotated[

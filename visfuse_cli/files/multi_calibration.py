@@ -91,7 +91,7 @@ def _numbers(where: str, table: Mapping[str, Any], key: str, shape: tuple[int, .
 def _opencv(scene: Path) -> tuple[list[View], list[Path]]:
     files = [path for path in list_files(scene, OPENCV_SUFFIXES) if path.stem not in ("init", "path")]
     if not files:
-        raise InputError(f"{scene}: has no calibration; expected {FILE}, or an OpenCV file <camera>.yaml for each camera")
+        raise InputError(f"{scene}: has no calibration; expected {FILE}, or an OpenCV file <camera>.yaml a camera")
     return [_opencv_view(path) for path in files], files
 
 
@@ -139,7 +139,8 @@ def _check(views: list[View], where: Path) -> None:
     if max(away) > FARTHEST:
         far = names[int(np.argmax(away))]
         raise InputError(
-            f"{where}: camera '{far}' is {max(away):g} m from '{names[0]}'; translation must be in metres (not millimetres)"
+            f"{where}: camera '{far}' is {max(away):g} m from '{names[0]}'; "
+            "translation must be in metres (not millimetres)"
         )
     if max(away) < 1e-6:
         raise InputError(f"{where}: all cameras stand in the same place; depth cannot be seen from one place")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
+from itertools import pairwise
 from typing import Any
 
 import cv2
@@ -110,7 +111,7 @@ def _rectangle(image: Image, box: Array, colour: tuple[int, int, int], dashed: b
     if not dashed:
         drawing.polyline(image, corners, colour)
         return
-    for a, b in zip(corners[:-1], corners[1:], strict=True):
+    for a, b in pairwise(corners):
         cuts = a + (b - a) * np.linspace(0, 1, 10)[:, None]
         for k in range(0, 9, 2):
             drawing.polyline(image, cuts[k : k + 2], colour)
@@ -133,7 +134,7 @@ class GroundPlan:
         for view, centre in zip(views, centres, strict=True):
             ahead = view.R[2, :2] / max(float(np.linalg.norm(view.R[2, :2])), 1e-9)
             aside = np.array([-ahead[1], ahead[0]])
-            wedge = np.stack([centre, centre + side / 22 * (ahead + 0.5 * aside), centre + side / 22 * (ahead - 0.5 * aside)])
+            wedge = centre + side / 22 * np.stack([0 * ahead, ahead + 0.5 * aside, ahead - 0.5 * aside])
             drawing.polyline(self._empty, self.at(wedge), (200, 200, 200), closed=True)
             drawing.label(self._empty, view.name, self.at(centre[None])[0], (200, 200, 200), 0.8)
         drawing.label(self._empty, f"grid {step} m", np.array([4.0, MAP_PX]), (200, 200, 200), 0.8)

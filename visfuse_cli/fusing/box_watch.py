@@ -149,9 +149,7 @@ class BoxWatch:
         cov = np.linalg.inv(weight.sum(axis=0))
         return Gaussian(cov @ np.einsum("iab,ib->a", weight, ground.mean[group]), cov)
 
-    def _given(
-        self, tracker: Tracker, grouped: list[NDArray[np.intp]], places: list[Gaussian]
-    ) -> dict[int, int]:
+    def _given(self, tracker: Tracker, grouped: list[NDArray[np.intp]], places: list[Gaussian]) -> dict[int, int]:
         """Which group belongs to whom: one to one, by one-step conditional maximum likelihood. Wu 2010, eq. 7."""
         beliefs = tracker.beliefs
         usable = [k for k, place in enumerate(places) if np.isfinite(place.mean).all()]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,8 +12,9 @@ from visfuse_cli.fusing.estimate import Sights, at_one_time, fuse, pair_up
 from visfuse_cli.fusing.noise import disagreement, restlessness
 from visfuse_cli.fusing.person import BOX, DT, VARIANCE, Person, Z
 from visfuse_cli.fusing.settings import FuseConfig
-from visfuse_cli.fusing.tracker import RIVALS, motion
+from visfuse_cli.fusing.tracker import motion
 from visfuse_cli.maths import fusion, fusion_rivals, gaussian
+from visfuse_cli.maths.fusion_rivals import Bank
 from visfuse_cli.maths.gaussian import times
 from visfuse_cli.maths.multiview import project
 from visfuse_cli.maths.smoothing import rauch_tung_striebel
@@ -67,7 +69,8 @@ def conclude(person: Person, P: Array, config: FuseConfig) -> Path | None:
     pixels, J = project(P[sights.camera], belief.mean[sights.owner, :3])
     if config.filter.adapt and config.smooth:
         noise, once = disagreement(sights, sights.z - pixels, t)
-        sigma_a = restlessness(*_places(sights, pixels, J, belief, once), t, sigma_a, config.filter.sigma_z, person.start)
+        places = _places(sights, pixels, J, belief, once)
+        sigma_a = restlessness(*places, t, sigma_a, config.filter.sigma_z, person.start)
         belief = _filtered(person, sights, P, t, state, config, noise, sigma_a)
         pixels, J = project(P[sights.camera], belief.mean[sights.owner, :3])
     cov = belief.cov.copy()
@@ -99,7 +102,8 @@ def _sights(rows: Array, seen: NDArray[np.bool_], state: Array, P: Array) -> Sig
     own = rows[owner, camera]
     a, b, c = own[:, VARIANCE].T
     R = np.stack([np.stack([a, b], axis=-1), np.stack([b, c], axis=-1)], axis=-2)
-    return at_one_time(Sights(owner, camera, own[:, Z], R, own[:, DT]), P, Gaussian(state, np.zeros((len(state), 6, 6))))
+    sights = Sights(owner, camera, own[:, Z], R, own[:, DT])
+    return at_one_time(sights, P, Gaussian(state, np.zeros((len(state), 6, 6))))
 
 
 def _filtered(
@@ -116,7 +120,7 @@ def _filtered(
     scaled = Sights(sights.owner, sights.camera, sights.z, sights.R * noise, sights.dt)
     belief = Gaussian(person.start.mean, person.start.cov * START_DOUBT**2)
     step = _pairwise_step(scaled, P, state[:, :3]) if config.fusion.method == "closed-loop" else None
-    bank = None
+    bank: Bank | None = None
     prior, posterior, transitions = [], [], []
     bounds = np.searchsorted(scaled.owner, np.arange(len(t) + 1))
     for k in range(len(t)):
@@ -131,7 +135,7 @@ def _filtered(
         else:
             bank = fusion_rivals.predicted(bank, F, Q) if bank is not None else None
             one = Sights(0 * scaled.owner[now], scaled.camera[now], scaled.z[now], scaled.R[now], scaled.dt[now])
-            banks = [bank]
+            banks: list[Bank | None] = [bank]
             after = fuse(config.fusion.method, Gaussian(ahead.mean[None], ahead.cov[None]), one, P, banks)
             belief, bank = Gaussian(after.mean[0], after.cov[0]), banks[0]
         prior.append(ahead)
@@ -146,7 +150,7 @@ def _filtered(
     return rauch_tung_striebel(filtered, predicted, np.stack(transitions))
 
 
-def _pairwise_step(sights: Sights, P: Array, near: Array):
+def _pairwise_step(sights: Sights, P: Array, near: Array) -> Callable[[int, Gaussian], Gaussian]:
     """The closed loop's step k from a prediction (6,), all pairs of all instants triangulated at once."""
     pairs = pair_up(sights, P, near)
     order = np.argsort(pairs.owner, kind="stable")
@@ -189,6 +193,3 @@ def _weights(sights: Sights, J: Array, shape: tuple[int, ...]) -> Array:
     weight = np.zeros(shape)
     weight[sights.owner, sights.camera] = share
     return weight
-
-
-__all__ = ["RIVALS", "Path", "conclude"]

@@ -1,8 +1,9 @@
-"""One instant's sightings to one estimate a person: agreement of the views, pairs, and the fusion that was asked for."""
+"""One instant's sightings to one estimate a person: agreement of the views, pairs, and the fusion asked for."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,7 +11,7 @@ from numpy.typing import NDArray
 from visfuse_cli.maths import fusion, fusion_rivals, triangulation
 from visfuse_cli.maths.assignment import gate_size
 from visfuse_cli.maths.fusion_rivals import Bank
-from visfuse_cli.maths.gaussian import times, transpose
+from visfuse_cli.maths.gaussian import inverse, times, transpose
 from visfuse_cli.maths.multiview import project
 from visfuse_cli.records import Array, Gaussian
 from visfuse_cli.vision.matching import agree
@@ -82,7 +83,7 @@ def consistent(sights: Sights, P: Array, near: Array, gate: float) -> NDArray[np
     if not len(sights):
         return good
     point = near.copy()
-    weight = np.linalg.inv(sights.R)
+    weight = inverse(sights.R)
     off = np.zeros_like(sights.z)
     for _ in range(2):
         pixels, J = project(P[sights.camera], point[sights.owner])
@@ -93,7 +94,7 @@ def consistent(sights: Sights, P: Array, near: Array, gate: float) -> NDArray[np
         information, vector = np.tile(1e-6 * np.eye(3), (people, 1, 1)), np.zeros((people, 3))
         np.add.at(information, sights.owner, J_W @ J)
         np.add.at(vector, sights.owner, times(J_W, off))
-        step = np.linalg.solve(information, vector[..., None])[..., 0]
+        step = np.asarray(np.linalg.solve(information, vector[..., None]), dtype=float)[..., 0]
         point = point + step
         off = off - times(J, step[sights.owner])
     chi2, count = np.zeros(people), np.zeros(people)
@@ -112,7 +113,7 @@ def pair_up(sights: Sights, P: Array, near: Array, count_once: bool = True) -> P
     first, second = [], []
     order = np.argsort(sights.owner, kind="stable")
     bounds = np.searchsorted(sights.owner[order], np.arange(len(near) + 1))
-    for begin, end in zip(bounds[:-1], bounds[1:], strict=True):
+    for begin, end in pairwise(bounds.tolist()):
         for a, b in triangulation.pairs_of(order[begin:end].tolist()):
             first.append(a)
             second.append(b)

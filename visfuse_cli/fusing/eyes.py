@@ -91,7 +91,7 @@ class PictureEyes:
     def __init__(self, views: list[View], footage: list[Any], config: FuseConfig) -> None:
         straight = [Straight(view, config.sight.pixels) for view in views]
         with ThreadPoolExecutor(THREADS) as pool:
-            empty = list(pool.map(lambda pair: _empty(*pair, config.background.warmup_s), zip(straight, footage, strict=True)))
+            empty = list(pool.map(_empty, straight, footage, [config.background.warmup_s] * len(views)))
         self._cameras = [Camera(each, picture, config) for each, picture in zip(straight, empty, strict=True)]
         self.P = np.stack(
             [each.K @ np.column_stack([view.R, view.t]) for each, view in zip(straight, views, strict=True)]

@@ -1,6 +1,8 @@
-"""What a whole track says of its own noise: how far its cameras disagree, for how long, and how hard the person turns."""
+"""What a whole track says of its own noise: how far its cameras disagree, and how hard the person turns."""
 
 from __future__ import annotations
+
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -75,7 +77,7 @@ def _likelihood(y: Array, R: Array, t: Array, used: NDArray[np.intp], sigma_z: f
     cov[:, :3, :] = cov[:, :, :3] = 0.0
     cov[:, :3, :3] = R[used[0]]
     belief, total = Gaussian(mean, cov), np.zeros(len(GRID))
-    for before, k in zip(used[:-1], used[1:], strict=True):
+    for before, k in pairwise(used.tolist()):
         F, Q = motion(t[k] - t[before], GRID, sigma_z)
         belief = gaussian.predict(belief, F, Q)
         belief, innovation = gaussian.update(belief, y[k] - belief.mean[:, :3], H, R[k])

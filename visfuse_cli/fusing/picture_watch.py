@@ -102,7 +102,8 @@ class PictureWatch:
     def _sightings(self, expected: list[Expected], who: int, body: Body) -> dict[int, Sighting]:
         """What each camera sees of one of the expected people, whose lengths are learnt."""
         found = {}
-        sigma = float(np.hypot(self._config.person.height_sigma / np.sqrt(max(body.height.looks / PRIOR_LOOKS, 1)), 0.03))
+        looks = max(body.height.looks / PRIOR_LOOKS, 1.0)
+        sigma = float(np.hypot(self._config.person.height_sigma / np.sqrt(looks), 0.03))
         for camera, dt in self._dt.items():
             there = expected[camera]
             if not (np.isfinite(there.box[who]).all() and there.depth[who] > 0):

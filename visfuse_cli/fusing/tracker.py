@@ -18,7 +18,6 @@ from visfuse_cli.records import Array, Gaussian, Sighting
 PRIOR_LOOKS = 12.0  # looks that the usual height and width count for
 REFUSED_S = 0.5  # s: a person outside the gate for so long is begun again where it is seen
 GATE = 1 - 1e-6  # of an agreed position against the prediction
-RIVALS = ("naive", "kim", "covariance-intersection")
 
 
 @dataclass(frozen=True, slots=True)
@@ -159,7 +158,7 @@ class Tracker:
                 person.missed += person.history.denied[-1]
 
     def end(self, t: float, in_view: NDArray[np.intp]) -> list[Person]:
-        """Let go whom nobody has seen for long, or who left; `in_view` (T,) counts the cameras whose picture holds it."""
+        """Let go whom nobody has seen for long, or who left; `in_view` (T,) counts the cameras that hold each."""
         life = self.config.life
         ended = []
         for person, views in zip(list(self.people), in_view, strict=True):

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from visfuse_cli.maths import gaussian
-from visfuse_cli.maths.gaussian import symmetrise, times
+from visfuse_cli.maths.gaussian import inverse, symmetrise, times
 from visfuse_cli.maths.multiview import project
 from visfuse_cli.records import Array, Gaussian, Innovation
 
@@ -35,10 +35,10 @@ def closed_loop(prior: Gaussian, owner: Rows, y: Array, R: Array) -> Gaussian:
         return prior
     local_prior = Gaussian(prior.mean[owner], prior.cov[owner])  # x_i+ = X+ fed back: Wu 2010, eq. 24
     local, _ = local_estimates(local_prior, y, R)
-    p_minus, p_plus = np.linalg.inv(prior.cov), np.linalg.inv(local.cov)
+    p_minus, p_plus = inverse(prior.cov), inverse(local.cov)
     information = p_minus.copy()
     np.add.at(information, owner, p_plus - p_minus[owner])
-    P = symmetrise(np.linalg.inv(symmetrise(information)))
+    P = inverse(symmetrise(information))
     phi = P[owner] @ p_plus  # Phi_i = P+ M^T (p_i+)^-1: Wu 2010, eq. 21, the inverse on the other factor
     correction = np.zeros_like(prior.mean)
     np.add.at(correction, owner, times(phi, local.mean - local_prior.mean))  # a sum: Wu 2010, eq. 22 without B
@@ -86,5 +86,5 @@ def _turns(owner: Rows) -> Rows:
 def degrees(pairs: NDArray[np.intp], owner: Rows, cameras: int) -> NDArray[np.intp]:
     """How many of a person's pairs (M, 2) each of a pair's two cameras is in (M, 2): its noise counts that often."""
     key = owner[:, None] * cameras + pairs
-    values, inverse, count = np.unique(key, return_inverse=True, return_counts=True)
+    _, inverse, count = np.unique(key, return_inverse=True, return_counts=True)
     return np.asarray(count[inverse].reshape(key.shape), dtype=np.intp)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from visfuse_cli.maths.fusion import C
-from visfuse_cli.maths.gaussian import symmetrise, times, transpose
+from visfuse_cli.maths.gaussian import inverse, symmetrise, times, transpose
 from visfuse_cli.maths.multiview import project
 from visfuse_cli.records import Array, Gaussian
 
@@ -63,7 +63,8 @@ def updated(bank: Bank, rows: NDArray[np.intp], y: Array, noise: Array) -> Bank:
     mean[rows] += times(gain[rows], y - bank.mean[rows, :3])
     keep = np.eye(6) - gain @ C
     joint = np.einsum("iab,ibjc,jdc->iajd", keep, bank.joint, keep)
-    joint[np.ix_(rows, range(6), rows, range(6))] += np.einsum("iab,ijbc,jdc->iajd", gain[rows], noise, gain[rows])
+    six = np.arange(6)
+    joint[np.ix_(rows, six, rows, six)] += np.einsum("iab,ijbc,jdc->iajd", gain[rows], noise, gain[rows])
     return Bank(bank.pairs, mean, joint)
 
 
@@ -73,7 +74,7 @@ def pair_noise(P: Array, R: Array, pairs: NDArray[np.intp], point: Array, cov: A
     P (K, 3, 4) and R (K, 2, 2) px^2 by camera, pairs (M, 2) of cameras, cov (M, 3, 3) of each point alone.
     """
     _, J = project(P[pairs], point[:, None, :])
-    weight = np.linalg.inv(R)
+    weight = inverse(R)
     gains = np.zeros((len(pairs), len(P), 3, 2))  # of each pair's point to each camera's pixels
     gains[np.arange(len(pairs))[:, None], pairs] = cov[:, None] @ transpose(J) @ weight[pairs]
     return np.asarray(np.einsum("ikab,kbc,jkdc->ijad", gains, R, gains))
@@ -82,8 +83,8 @@ def pair_noise(P: Array, R: Array, pairs: NDArray[np.intp], point: Array, cov: A
 def naive(bank: Bank) -> Gaussian:
     """Convex combination as if the local estimates (N, 6) were independent ("Austere"): (6,)."""
     local = bank.local
-    information = np.linalg.inv(local.cov)
-    cov = symmetrise(np.linalg.inv(symmetrise(information.sum(axis=0))))
+    information = inverse(local.cov)
+    cov = inverse(information.sum(axis=0))
     return Gaussian(cov @ times(information, local.mean).sum(axis=0), cov)
 
 
@@ -97,7 +98,7 @@ def kim(bank: Bank) -> Gaussian:
     # Directions without noise repeat what others say, so that they are left out and not divided by.
     half = (vectors[:, used] / np.sqrt(values[used])).T / scale
     E = half @ np.tile(np.eye(6), (len(bank.pairs), 1))
-    cov = symmetrise(np.linalg.inv(symmetrise(E.T @ E)))
+    cov = inverse(E.T @ E)
     return Gaussian(cov @ (E.T @ (half @ bank.mean.ravel())), cov)
 
 
@@ -107,10 +108,10 @@ def covariance_intersection(bank: Bank) -> Gaussian:
     The weights maximise log det of the combined information by the multiplicative rounds of optimal design.
     """
     local = bank.local
-    information = np.linalg.inv(local.cov)
+    information = inverse(local.cov)
     weights = np.full(len(bank.pairs), 1 / len(bank.pairs))
     for _ in range(ROUNDS):
-        cov = np.linalg.inv(np.einsum("i,iab->ab", weights, information))
+        cov = inverse(np.einsum("i,iab->ab", weights, information))
         weights = weights * np.einsum("ab,iba->i", cov, information) / 6
-    cov = symmetrise(np.linalg.inv(symmetrise(np.einsum("i,iab->ab", weights, information))))
+    cov = inverse(np.einsum("i,iab->ab", weights, information))
     return Gaussian(cov @ np.einsum("i,iab,ib->a", weights, information, local.mean), cov)

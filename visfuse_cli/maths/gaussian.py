@@ -21,6 +21,11 @@ def symmetrise(cov: Array) -> Array:
     return (cov + transpose(cov)) / 2
 
 
+def inverse(cov: Array) -> Array:
+    """The information matrices (..., n, n) of covariances; raises LinAlgError where one is singular."""
+    return symmetrise(np.asarray(np.linalg.inv(cov), dtype=float))
+
+
 def times(matrix: Array, vector: Array) -> Array:
     """Matrices (..., n, m) times vectors (..., m): (..., n)."""
     return (matrix @ vector[..., None])[..., 0]

@@ -67,7 +67,7 @@ def on_plane(P: Array, pixels: Array, height: Array | float = 0.0) -> tuple[Arra
     """
     shifted = P[..., 2] * np.asarray(height)[..., None] + P[..., 3]
     image_from_plane = np.stack(np.broadcast_arrays(P[..., 0], P[..., 1], shifted), axis=-1)
-    plane_from_image = np.linalg.inv(image_from_plane)
+    plane_from_image = np.asarray(np.linalg.inv(image_from_plane), dtype=float)
     homogeneous = times(plane_from_image[..., :2], pixels) + plane_from_image[..., 2]
     w = homogeneous[..., 2:]
     w = np.where(w > 0, w, np.nan)  # the camera's side of the horizon: P has positive depths
@@ -93,8 +93,8 @@ def fundamental(P1: Array, P2: Array) -> Array:
     epipole = times(M2, centre) + P2[..., 3]
     zero = np.zeros_like(epipole[..., 0])
     a, b, c = np.moveaxis(epipole, -1, 0)
-    cross = np.stack([zero, -c, b, c, zero, -a, -b, a, zero], axis=-1).reshape(*zero.shape, 3, 3)
-    return np.asarray(cross @ M2 @ np.linalg.inv(M1))
+    cross: Array = np.stack([zero, -c, b, c, zero, -a, -b, a, zero], axis=-1).reshape(*zero.shape, 3, 3)
+    return np.asarray(cross @ M2 @ np.linalg.inv(M1), dtype=float)
 
 
 def epipolar_distance(F: Array, z1: Array, z2: Array) -> Array:

@@ -1,4 +1,4 @@
-"""One point seen by several cameras: direct linear transform, Gauss-Newton, covariance by propagation (Wu 2010, sec. 4)."""
+"""One point seen by several cameras: direct linear transform, Gauss-Newton, propagated covariance (Wu 2010, sec. 4)."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from visfuse_cli.maths.gaussian import symmetrise, times, transpose
+from visfuse_cli.maths.gaussian import inverse, symmetrise, times, transpose
 from visfuse_cli.maths.multiview import project
 from visfuse_cli.records import Array, Gaussian
 
@@ -37,7 +37,7 @@ def refine(P: Array, z: Array, R: Array, start: Array) -> tuple[Gaussian, Array]
     z (..., V, 2) px with noise R (..., V, 2, 2) under P (..., V, 3, 4). Where the rays say nothing, or the point is
     not before every camera, the mean is NaN.
     """
-    weight = np.linalg.inv(R)
+    weight = inverse(R)
     point = start
     for _ in range(ROUNDS):
         pixels, J = project(P, point[..., None, :])
@@ -59,10 +59,10 @@ def triangulate(P: Array, z: Array, R: Array) -> tuple[Gaussian, Array]:
 
 def _inverse(information: Array) -> Array:
     """Inverses (..., 3, 3); NaN where a matrix is singular or not finite."""
-    good = np.isfinite(information).all(axis=(-2, -1))
+    good = np.asarray(np.isfinite(information).all(axis=(-2, -1)))
     safe = np.where(good[..., None, None], information, np.eye(3))
     scale = np.trace(safe, axis1=-2, axis2=-1) / 3
-    good &= np.linalg.det(safe) > 1e-15 * scale**3
+    good = good & (np.asarray(np.linalg.det(safe)) > 1e-15 * scale**3)
     safe = np.where(good[..., None, None], safe, np.eye(3))
     return np.where(good[..., None, None], np.linalg.inv(safe), np.nan)
 
@@ -70,9 +70,9 @@ def _inverse(information: Array) -> Array:
 def meeting_angle(P: Array, first: NDArray[np.intp], second: NDArray[np.intp], point: Array) -> Array:
     """Angle (M,) rad, 0 to pi/2, at which the rays of cameras first and second (M,) of P (C, 3, 4) meet in (M, 3)."""
     centres = -np.linalg.solve(P[:, :, :3], P[:, :, 3:])[..., 0]
-    rays = [point - centres[index] for index in (first, second)]
-    sine = np.linalg.norm(np.cross(*rays), axis=-1)
-    return np.asarray(np.arctan2(sine, np.abs(np.sum(rays[0] * rays[1], axis=-1))))
+    a, b = point - centres[first], point - centres[second]
+    sine = np.linalg.norm(np.cross(a, b), axis=-1)
+    return np.asarray(np.arctan2(sine, np.abs(np.sum(a * b, axis=-1))))
 
 
 def pairs_of(cameras: list[int]) -> list[tuple[int, int]]:

@@ -24,8 +24,9 @@ CAP = 3.0  # half widths beyond which a pixel is nobody's
 class Expected:
     """People in one camera's picture, T of them: where each is expected.
 
-    box [u0, v0, u1, v1] (T, 4) px, axis (T, 2, 2) px from foot to head, point (T, 2) px that is tracked, half_width (T,) px, depth (T,) m, scale (T,)
-    px per m, reach (T,) px that each may be off, and rank (T,): a lower one owns pixels before a higher one.
+    box [u0, v0, u1, v1] (T, 4) px, axis (T, 2, 2) px from foot to head, point (T, 2) px that is tracked,
+    half_width (T,) px, depth (T,) m, scale (T,) px per m, reach (T,) px that each may be off, and rank (T,):
+    a lower one owns pixels before a higher one.
     """
 
     box: Array
