@@ -114,7 +114,7 @@ class Sighting:
     """One person in one camera at one instant: the tracked point z (2,) px without distortion, its noise R (2, 2).
 
     box (4,) px as the picture shows it, and `seen`, the share of the person that is (0 to 1); `dt` (s) from the
-    instant of the set to the camera's own; `colours` (k,), where the footage was looked at.
+    instant of the set to the camera's own.
     """
 
     z: Array
@@ -122,7 +122,6 @@ class Sighting:
     box: Array
     dt: float = 0.0
     seen: float = 1.0
-    colours: Array | None = None
 
 
 @dataclass(frozen=True, slots=True)

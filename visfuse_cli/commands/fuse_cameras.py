@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import ExitStack
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import tee
 from pathlib import Path
 from typing import Any
@@ -24,7 +24,9 @@ from visfuse_cli.files.scene import check_scene
 from visfuse_cli.files.spool import TrackSpool
 from visfuse_cli.files.video import VideoSource, describe
 from visfuse_cli.files.video_writer import VideoWriter
+from visfuse_cli.fusing import clocks
 from visfuse_cli.fusing.annotate import Drawn, GroundPlan, active, draw_view, mosaic, mosaic_size
+from visfuse_cli.fusing.audit import Finding, complaints
 from visfuse_cli.fusing.conclude import Path as Settled
 from visfuse_cli.fusing.conclude import conclude
 from visfuse_cli.fusing.eyes import BoxEyes, Eyes, PictureEyes
@@ -35,9 +37,14 @@ from visfuse_cli.fusing.tracker import Tracker
 from visfuse_cli.fusing.visibility import visibility
 from visfuse_cli.maths import multiview
 from visfuse_cli.pipeline import Run
-from visfuse_cli.records import Array, RunRequest, RunResult, View
+from visfuse_cli.records import Array, RunRequest, RunResult, TimeAudit, View
 
 __all__ = ["FuseConfig", "run", "text"]
+
+CLOCK_S = 60.0  # s of footage from which clocks are estimated
+CLOCK_STEP_S = 0.2  # s between the frames that the first, coarse round looks at
+CLOCK_ROUNDS = 6
+CLOCK_DONE_S = 0.004
 
 
 @dataclass(slots=True)
@@ -63,6 +70,10 @@ class _Results:
     begun: list[tuple[int, int]] = field(default_factory=list)  # first frame, id
     extent: Array = field(default_factory=lambda: np.zeros((0, 2)))  # corners of where people were, m
     rejected: dict[str, int] = field(default_factory=dict)
+    sightings: Array = field(default_factory=lambda: np.zeros(0))  # by camera
+    share: Array = field(default_factory=lambda: np.zeros(0))  # of what was measured, summed over sets and people
+    square: Array = field(default_factory=lambda: np.zeros(0))  # px^2, of the reprojection, summed
+    findings: list[Finding] = field(default_factory=list)
 
 
 def run(request: RunRequest) -> RunResult:
@@ -77,16 +88,31 @@ def run(request: RunRequest) -> RunResult:
         Run(request.progress) as run_,
         TrackSpool(folder, "fuse-cameras", request.seed, "world") as spool,
     ):
+        if request.options["estimate_offsets"]:
+            offsets = _estimated(scene, offsets, request, run_)
         sources = _open(scene, request)
-        _track(scene, sources, offsets, config, run_, spool, results)
+        with run_.stage("warm up"):
+            eyes = _eyes(scene, sources, config)
+        tracker = Tracker(eyes.P, config)
+        for ended in _follow(scene, sources, eyes, tracker, offsets, run_):
+            run_.count("sets of frames")
+            with run_.stage("settle"):
+                _settle(ended, eyes, scene, config, run_, spool, results)
+        with run_.stage("settle"):
+            _settle(tracker.finish(), eyes, scene, config, run_, spool, results)
+        results.findings = tracker.audit.findings(eyes.zoom)
+        for warning in complaints(scene.names, results.findings, _interval(sources)):
+            run_.warn(warning)
         audits = {name: source.audit() for name, source in sources.items()}
         for audit in audits.values():
             for warning in audit.warnings:
                 run_.warn(warning)
+        for warning in _shorter(audits):
+            run_.warn(warning)
         write_image(folder / "map.png", _plan(scene, results).whole(_drawn(scene, config, spool, results)))
         if request.video and run_.stopped_by is None and all(each.video for each in scene.footage):
             _annotate(scene, offsets, folder, request, run_, spool, results)
-        summary = _summary(scene, run_, results, folder)
+        summary = _summary(scene, offsets, run_, results, folder)
         write_run_json(
             folder / "run.json",
             command="fuse-cameras",
@@ -138,21 +164,16 @@ def _offsets(config: FuseConfig, scene: _Scene) -> dict[str, float]:
     return {name: config.fusion.offsets.get(name, 0.0) for name in scene.names}
 
 
-def _track(
+def _follow(
     scene: _Scene,
     sources: dict[str, VideoSource],
+    eyes: Eyes,
+    tracker: Tracker,
     offsets: dict[str, float],
-    config: FuseConfig,
     run_: Run,
-    spool: TrackSpool,
-    results: _Results,
-) -> None:
-    """Follow everybody through the whole footage."""
-    with run_.stage("warm up"):
-        eyes = _eyes(scene, sources, config)
-    tracker = Tracker(eyes.P, config)
+) -> Iterator[list[Person]]:
+    """Follow everybody through the footage; yields, set by set, whom nobody follows any more."""
     for instant in run_.synchronise(sources, _tolerance(sources), offsets):
-        run_.count("sets of frames")
         frame = instant.frames[scene.names[0]].index
         with run_.stage("detect"):
             eyes.detect(instant)
@@ -162,17 +183,49 @@ def _track(
             sightings = eyes.look(tracker)
         with run_.stage("fuse"):
             tracker.update(frame, sightings)
-            inside, clear = visibility(tracker.beliefs, eyes.sizes, eyes.P, config)
+            inside, clear = visibility(tracker.beliefs, eyes.sizes, eyes.P, tracker.config)
             tracker.miss(clear & eyes.open, sightings)
+            tracker.watch(clear & eyes.open)
             ended = tracker.end(instant.t, np.count_nonzero(inside, axis=1))
         with run_.stage("newcomers"):
             tracker.begin(frame, instant.t, eyes.newcomers(tracker))
         with run_.stage("learn"):
             eyes.learn(instant.t, tracker)
-        with run_.stage("settle"):
-            _settle(ended, eyes.P, scene, config, run_, spool, results)
-    with run_.stage("settle"):
-        _settle(tracker.finish(), eyes.P, scene, config, run_, spool, results)
+        yield ended
+
+
+def _estimated(scene: _Scene, offsets: dict[str, float], request: RunRequest, run_: Run) -> dict[str, float]:
+    """The clocks' offsets (s by camera): places that cameras see alone agree roughly, tracks of all of them exactly."""
+    config: FuseConfig = request.config
+    begin = request.start or 0.0
+    part = replace(request, end=min(begin + CLOCK_S, request.end or np.inf))
+    sources = _open(scene, part)
+    eyes = _eyes(scene, sources, config)
+    walks = [clocks.Walks() for _ in scene.names]
+    for camera, source in enumerate(sources.values()):
+        due = -np.inf
+        for frame in run_.frames(source):
+            if frame.t >= due:
+                due = frame.t + CLOCK_STEP_S
+                walks[camera].add(frame.t, eyes.alone(camera, frame))
+    given = np.array([offsets[name] for name in scene.names])
+    found = clocks.coarse(walks, given, config.fusion.largest_offset)
+    if found is None:
+        run_.warn(
+            "--estimate-offsets: too few people walk where cameras see them alone; fusion.offsets is left as it is"
+        )
+        return offsets
+    for _ in range(CLOCK_ROUNDS):
+        sources = _open(scene, part)
+        tracker = Tracker(eyes.P, config)
+        eyes = _eyes(scene, sources, config)
+        for _ in _follow(scene, sources, eyes, tracker, dict(zip(scene.names, found.tolist(), strict=True)), run_):
+            pass
+        better = clocks.corrected(found, tracker.audit.findings(eyes.zoom))
+        moved, found = float(np.abs(better - found).max()), better
+        if moved < CLOCK_DONE_S:
+            break
+    return {name: round(float(seconds), 4) for name, seconds in zip(scene.names, found, strict=True)}
 
 
 def _eyes(scene: _Scene, sources: dict[str, VideoSource], config: FuseConfig) -> Eyes:
@@ -183,21 +236,33 @@ def _eyes(scene: _Scene, sources: dict[str, VideoSource], config: FuseConfig) ->
 
 
 def _settle(
-    ended: list[Person], P: Array, scene: _Scene, config: FuseConfig, run_: Run, spool: TrackSpool, results: _Results
+    ended: list[Person], eyes: Eyes, scene: _Scene, config: FuseConfig, run_: Run, spool: TrackSpool, results: _Results
 ) -> None:
     """Turn whom nobody follows any more into records."""
     for person in ended:
-        path: Settled | None = conclude(person, P, config)
+        path: Settled | None = conclude(person, eyes.P, config)
         if path is None:
             reason = person.ended_by if not person.confirmed else "too short"
             results.rejected[reason] = results.rejected.get(reason, 0) + 1
             run_.count("rejected")
             continue
+        path = replace(path, residual=path.residual * eyes.zoom[:, None])
         spool.add(track_record(path, scene.names, scene.R, scene.t))
         results.begun.append((int(path.frame[0]), path.id))
+        _contribute(path, results)
         places = np.concatenate([results.extent, path.belief.mean[:, :2]])
         results.extent = np.stack([places.min(axis=0), places.max(axis=0)])
         run_.count("people")
+
+
+def _contribute(path: Settled, results: _Results) -> None:
+    """Count what each camera added to a path."""
+    seen, square = path.seen.sum(axis=0), np.nansum(np.sum(path.residual**2, axis=2), axis=0)
+    if not len(results.sightings):
+        results.sightings, results.share, results.square = 0.0 * seen, 0.0 * square, 0.0 * square
+    results.sightings = results.sightings + seen
+    results.share = results.share + path.weight.sum(axis=0)
+    results.square = results.square + square
 
 
 def _plan(scene: _Scene, results: _Results) -> GroundPlan:
@@ -246,11 +311,28 @@ def _annotate(
 
 def _tolerance(sources: dict[str, VideoSource]) -> float:
     """How far (s) a frame may be from the instant of its set: half of the longest interval, and a little."""
-    return 0.55 / min(source.nominal_rate for source in sources.values())
+    return 0.55 * _interval(sources)
 
 
-def _summary(scene: _Scene, run_: Run, results: _Results, folder: Path) -> dict[str, Any]:
+def _interval(sources: dict[str, VideoSource]) -> float:
+    """The longest time (s) from one frame to the next."""
+    return 1 / min(source.nominal_rate for source in sources.values())
+
+
+def _shorter(audits: dict[str, TimeAudit]) -> list[str]:
+    """Which cameras' footage ends well before the longest."""
+    longest = max(audit.duration_s for audit in audits.values())
+    return [
+        f"camera '{name}' ends after {audit.duration_s:.1f} s, {longest - audit.duration_s:.1f} s before the longest"
+        for name, audit in audits.items()
+        if longest - audit.duration_s > max(1.0, 0.02 * longest)
+    ]
+
+
+def _summary(scene: _Scene, offsets: dict[str, float], run_: Run, results: _Results, folder: Path) -> dict[str, Any]:
     return {
+        "per_camera": _per_camera(scene, results),
+        "offsets": offsets,
         "people": len(results.begun),
         "rejected": results.rejected,
         "sets_of_frames": run_.counts["sets of frames"],
@@ -259,11 +341,33 @@ def _summary(scene: _Scene, run_: Run, results: _Results, folder: Path) -> dict[
     }
 
 
+def _per_camera(scene: _Scene, results: _Results) -> dict[str, dict[str, Any]]:
+    """What each camera added, and how it fits the others."""
+    total = float(results.share.sum()) if len(results.share) else 0.0
+    told: dict[str, dict[str, Any]] = {}
+    for c, (name, found) in enumerate(zip(scene.names, results.findings, strict=True)):
+        n = float(results.sightings[c]) if len(results.sightings) else 0.0
+        told[name] = {
+            "sightings": int(n),
+            "share": float(results.share[c]) / total if total else 0.0,
+            "reprojection_px": float(np.sqrt(results.square[c] / n)) if n else None,
+            "shift_px": found.shift.tolist(),
+            "late_s": found.late,
+            "unused": found.unused,
+        }
+    return told
+
+
 def text(result: RunResult) -> str:
     """The summary for people."""
     summary = result.summary
     lines = [f"{'people':<12} {summary['people']}"]
     lines.append(f"{'cameras':<12} {', '.join(summary['cameras'])}")
     lines.append(f"{'sets':<12} {summary['sets_of_frames']}")
+    if any(summary["offsets"].values()):
+        lines.append(f"{'offsets':<12} " + ", ".join(f"{name} {s:+.3f} s" for name, s in summary["offsets"].items()))
+    for name, each in summary["per_camera"].items():
+        error = "-" if each["reprojection_px"] is None else f"{each['reprojection_px']:.1f} px"
+        lines.append(f"  {name:<10} {each['sightings']:>7} sightings, {each['share']:>4.0%} of the fix, {error}")
     lines.append(f"{'results':<12} {summary['out']}")
     return "\n".join(lines)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from visfuse_cli.fusing.clocks import places_alone
 from visfuse_cli.fusing.settings import FuseConfig
 from visfuse_cli.fusing.tracker import Newcomer, Tracker
 from visfuse_cli.fusing.visibility import visibility
@@ -87,6 +88,12 @@ class BoxWatch:
         gain = point.cov[:, 2] / (point.cov[2, 2] + sigma**2)
         cov = point.cov - np.outer(gain, point.cov[2])
         return Gaussian(point.mean + gain * (level - point.mean[2]), (cov + cov.T) / 2)
+
+    def places(self, camera: int, boxes: Array) -> Array:
+        """Where on the ground (k, 2) m one camera's boxes [x, y, w, h, ...] (n, 5) alone put people."""
+        straight = self._straight(np.full(len(boxes), camera, dtype=np.intp), boxes[:, :4])
+        person = self._config.person
+        return places_alone(self._P[camera], straight, self._sizes[camera], person.height, person.width)
 
     def _gather(self, boxes: dict[int, Array], dt: dict[int, float]) -> Boxes | None:
         camera, shown = [], []

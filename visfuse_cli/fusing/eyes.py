@@ -37,10 +37,14 @@ class Eyes(Protocol):
 
     P: Array
     sizes: Array
+    zoom: Array  # (C,): pixels of the footage per pixel measured in
     open: NDArray[np.bool_]  # (C,): which cameras are in the latest set
 
     def detect(self, instant: FrameSet) -> None:
         """Look at a set of frames."""
+
+    def alone(self, camera: int, frame: Frame) -> Array:
+        """Where on the ground (k, 2) m one camera's frame alone puts people."""
 
     def look(self, tracker: Tracker) -> list[dict[int, Sighting]]:
         """Sightings of everybody followed."""
@@ -58,6 +62,7 @@ class BoxEyes:
     def __init__(self, views: list[View], boxes: list[dict[int, Array]], config: FuseConfig) -> None:
         self.P = np.stack([multiview.projection(view) for view in views])
         self.sizes = np.array([view.size for view in views], dtype=float)
+        self.zoom = np.ones(len(views))
         self.open = np.zeros(len(views), dtype=bool)
         self._names = [view.name for view in views]
         self._boxes = boxes
@@ -72,6 +77,11 @@ class BoxEyes:
         self._dt = {camera: frame.t - instant.t for camera, frame in found.items()}
         rows = {camera: self._boxes[camera].get(frame.index) for camera, frame in found.items()}
         self._now = {camera: boxes for camera, boxes in rows.items() if boxes is not None}
+
+    def alone(self, camera: int, frame: Frame) -> Array:
+        """Where on the ground (k, 2) m one camera's boxes alone put people."""
+        boxes = self._boxes[camera].get(frame.index)
+        return np.zeros((0, 2)) if boxes is None else self._watch.places(camera, boxes)
 
     def look(self, tracker: Tracker) -> list[dict[int, Sighting]]:
         """Sightings of everybody followed."""
@@ -97,6 +107,7 @@ class PictureEyes:
             [each.K @ np.column_stack([view.R, view.t]) for each, view in zip(straight, views, strict=True)]
         )
         self.sizes = np.array([each.size for each in straight], dtype=float)
+        self.zoom = np.array([view.lens.K[0, 0] / each.K[0, 0] for each, view in zip(straight, views, strict=True)])
         self.open = np.zeros(len(views), dtype=bool)
         self._names = [view.name for view in views]
         self._watch = PictureWatch(self._cameras, self.P, config)
@@ -109,6 +120,11 @@ class PictureEyes:
         self.open = np.isin(np.arange(len(self._names)), list(found))
         self._dt = {camera: frame.t - instant.t for camera, frame in found.items()}
         list(self._pool.map(lambda pair: self._cameras[pair[0]].look(pair[1].image), found.items()))
+
+    def alone(self, camera: int, frame: Frame) -> Array:
+        """Where on the ground (k, 2) m what moves in one camera's frame alone puts people."""
+        self._cameras[camera].look(frame.image)
+        return self._watch.places(camera)
 
     def look(self, tracker: Tracker) -> list[dict[int, Sighting]]:
         """Sightings of everybody followed."""

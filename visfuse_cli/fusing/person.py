@@ -96,7 +96,6 @@ class Person:
     t: float
     last_seen: float
     bank: Bank | None = None
-    colours: Array | None = None
     seen_frames: int = 0  # instants at which two cameras or more saw it
     first_seen: float = 0.0
     last_pair: float = 0.0  # s: when two cameras or more last saw it

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 
+from visfuse_cli.fusing.clocks import places_alone
 from visfuse_cli.fusing.person import Body, Person, usual_body
 from visfuse_cli.fusing.settings import FuseConfig
 from visfuse_cli.fusing.sighting import expect, learn_body, tracked_point
@@ -53,6 +55,14 @@ class PictureWatch:
         sizes = np.array([camera.straight.size for camera in cameras])
         self._occupancy = Occupancy(P, sizes, config.person.height)
         self._dt: dict[int, float] = {}
+
+    def places(self, camera: int) -> Array:
+        """Where on the ground (k, 2) m what moves in one camera's latest picture alone puts people."""
+        _, _, blobs, _ = cv2.connectedComponentsWithStats(self._cameras[camera].mask)
+        x, y, w, h = blobs[1:, :4].T.astype(float)
+        boxes = np.column_stack([x, y, x + w, y + h]) - 0.5
+        person, size = self._config.person, np.array(self._cameras[camera].straight.size)
+        return places_alone(self._P[camera], boxes, size, person.height, person.width)
 
     def look(self, dt: dict[int, float], tracker: Tracker) -> list[dict[int, Sighting]]:
         """Sightings of everybody followed, by the cameras in `dt` (s), whose pictures were looked at."""

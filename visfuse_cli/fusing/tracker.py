@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from visfuse_cli.fusing.audit import Audit
 from visfuse_cli.fusing.estimate import Sights, at_one_time, consistent, fuse
 from visfuse_cli.fusing.person import History, Person, usual_body
 from visfuse_cli.fusing.settings import FuseConfig
@@ -54,6 +55,7 @@ class Tracker:
         self.P, self.config = P, config
         self.people: list[Person] = []
         self._next_id = 1
+        self.audit = Audit(len(P))
 
     @property
     def beliefs(self) -> Gaussian:
@@ -83,6 +85,8 @@ class Tracker:
             return
         prior = self.beliefs
         sights = at_one_time(_flat(sightings), self.P, prior)
+        settled = np.array([person.confirmed for person in self.people])
+        self.audit.take(sights.of(settled[sights.owner]), self.P, prior)
         good = consistent(sights, self.P, prior.mean[:, :3], self.config.sight.gate)
         good &= self._expected(sights.of(good), good, prior)
         used = sights.of(good)
@@ -156,6 +160,14 @@ class Tracker:
             if not seen:
                 person.history.denied[-1] = int(np.count_nonzero(open_sights))
                 person.missed += person.history.denied[-1]
+
+    def watch(self, clear: NDArray[np.bool_]) -> None:
+        """Take note of which cameras with a clear sight (T, C) were believed to see whom."""
+        settled = [k for k, person in enumerate(self.people) if person.confirmed]
+        used = np.zeros_like(clear)
+        for k in settled:
+            used[k, list(self.people[k].last)] = True
+        self.audit.sights(clear[settled], used[settled])
 
     def end(self, t: float, in_view: NDArray[np.intp]) -> list[Person]:
         """Let go whom nobody has seen for long, or who left; `in_view` (T,) counts the cameras that hold each."""

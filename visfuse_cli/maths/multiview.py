@@ -89,7 +89,7 @@ def ground_point(P: Array, pixels: Array, R: Array, height: Array | float, heigh
 def fundamental(P1: Array, P2: Array) -> Array:
     """F (..., 3, 3) of pairs of cameras (..., 3, 4): x2^T F x1 = 0, both rows of the line in pixels."""
     M1, M2 = P1[..., :3], P2[..., :3]
-    centre = -np.linalg.solve(M1, P1[..., 3:])[..., 0]
+    centre = -np.asarray(np.linalg.solve(M1, P1[..., 3:]), dtype=float)[..., 0]
     epipole = times(M2, centre) + P2[..., 3]
     zero = np.zeros_like(epipole[..., 0])
     a, b, c = np.moveaxis(epipole, -1, 0)

@@ -12,7 +12,6 @@ from visfuse_cli.maths.assignment import gate_size
 from visfuse_cli.maths.gaussian import mahalanobis
 from visfuse_cli.records import Array, Gaussian
 
-COLOUR_SIGMA = 0.12  # of the distance of two views' colours of one person: cameras differ in exposure
 GATE = 0.999  # probability inside
 
 
@@ -21,7 +20,7 @@ class Boxes:
     """All boxes of one instant, n of them: what each says about where its person stands and how tall that one is.
 
     camera (n,); z (n, 2) px the tracked point without distortion, R (n, 2, 2) its noise; ground (n, 2) m and height
-    (n,) m with its deviation; colours (n, k) or None.
+    (n,) m with its deviation.
     """
 
     camera: NDArray[np.intp]
@@ -30,7 +29,6 @@ class Boxes:
     ground: Gaussian
     height: Array
     height_sigma: Array
-    colours: Array | None = None
 
     def __len__(self) -> int:
         return len(self.camera)
@@ -39,7 +37,7 @@ class Boxes:
 def disagreement(boxes: Boxes, P: Array) -> Array:
     """How badly each two boxes go together (n, n), chi-square; infinite within a camera and outside the gates.
 
-    Epipolar distance of the tracked points, places on the ground, heights, and colours where they are known.
+    Epipolar distance of the tracked points, places on the ground, and heights.
     """
     first, second = np.triu_indices(len(boxes), 1)
     other = boxes.camera[first] != boxes.camera[second]
@@ -52,9 +50,6 @@ def disagreement(boxes: Boxes, P: Array) -> Array:
     taller = boxes.height[first] - boxes.height[second]
     total += taller**2 / (boxes.height_sigma[first] ** 2 + boxes.height_sigma[second] ** 2)
     total = np.where(total < gate_size(3, GATE), total, np.inf)
-    if boxes.colours is not None:
-        unlike = np.linalg.norm(np.sqrt(boxes.colours[first]) - np.sqrt(boxes.colours[second]), axis=-1) / np.sqrt(2)
-        total += (unlike / COLOUR_SIGMA) ** 2 / 4
     near = np.isfinite(total)
     a, b = first[near], second[near]
     F = multiview.fundamental(P[boxes.camera[a]], P[boxes.camera[b]])
