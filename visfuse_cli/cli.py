@@ -293,7 +293,7 @@ def fuse_cameras(
         progress=not (no_progress or quiet or _quiet),
         argv=tuple(sys.argv),
     )
-    _report(command.run(request), as_json, quiet, command.text)
+    _report(_with_page(command.run(request), request.report), as_json, quiet, command.text)
 
 
 @app.command("demo")
