@@ -201,5 +201,7 @@ def _tiles(views: list[View]) -> tuple[int, tuple[int, int]]:
     """Columns of the mosaic, and the even size of a tile."""
     wide, high = np.max([view.size for view in views], axis=0)
     scale = min(1.0, TILE_PX / max(wide, high))
-    columns = int(np.ceil(np.sqrt(len(views) + 1)))
+    count = len(views) + 1
+    # The arrangement whose picture is nearest to 16:9.
+    columns = min(range(1, count + 1), key=lambda n: abs(np.log(n * wide / (-(-count // n) * high) / (16 / 9))))
     return columns, (int(wide * scale) // 2 * 2, int(high * scale) // 2 * 2)

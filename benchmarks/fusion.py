@@ -1,0 +1,95 @@
+"""Fusion of several cameras: `python benchmarks/fusion.py --seeds 10`.
+
+First a simulation of walks before four cameras (pixels with noise, no pictures): every method's mean squared error as
+a share of the centralised bound, and its normalised error squared. Then rendered yards (four cameras 640x480, 20 fps,
+three people who cross in the middle) through the real command: who was found, hands changed, position error.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import json
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+from samples.people import crossing
+from samples.yard import write_yard
+from tests.test_fusion import simulate
+
+METHODS = ("central", "closed-loop", "naive", "kim", "covariance-intersection")
+GATE_M = 0.5
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seeds", type=int, default=10)
+    parser.add_argument("--runs", type=int, default=200, help="of the simulation")
+    args = parser.parse_args()
+    found = simulate(list(METHODS), runs=args.runs)
+    print(f"{'simulated':<24} {'MSE / bound':>12} {'NEES (6 is right)':>18}")
+    for method in METHODS:
+        print(f"{method:<24} {found[method][0] / found['central'][0]:12.3f} {found[method][1]:18.2f}")
+    print(
+        f"\n{'rendered':<10} {'people':>7} {'tracks':>7} {'covered':>8} {'switches':>9} {'RMSE m':>8} {'NEES':>6} {'x real time':>12}"
+    )
+    totals = []
+    for seed in range(args.seeds):
+        with tempfile.TemporaryDirectory() as folder:
+            scene, out = Path(folder) / "scene", Path(folder) / "run"
+            yard = crossing(seed)
+            write_yard(yard, scene)
+            begun = time.perf_counter()
+            command = [sys.executable, "-m", "visfuse_cli", "fuse-cameras", str(scene), "--out", str(out)]
+            subprocess.run([*command, "--no-video", "--no-report", "-q"], check=True)
+            ratio = yard.seconds / (time.perf_counter() - begun)
+            row = [len(yard.walkers), *score(scene / "truth.csv", out / "tracks.json"), ratio]
+        totals.append(row)
+        print("{:<10} {:7d} {:7d} {:8.3f} {:9d} {:8.4f} {:6.2f} {:12.2f}".format(f"seed {seed}", *row))
+    mean = np.mean(totals, axis=0)
+    print("{:<10} {:7.1f} {:7.1f} {:8.3f} {:9.1f} {:8.4f} {:6.2f} {:12.2f}".format("mean", *mean))
+
+
+def score(truth_file: Path, tracks_file: Path) -> tuple[int, float, int, float, float]:
+    """Tracks, share of true positions covered, hands changed, RMSE m, NEES."""
+    truth: dict[int, dict[int, np.ndarray]] = {}
+    with open(truth_file, newline="", encoding="utf-8") as file:
+        for row in csv.DictReader(file):
+            state = np.array([float(row[key]) for key in ("x", "y", "z", "vx", "vy", "vz")])
+            truth.setdefault(int(row["frame"]), {})[int(row["id"])] = state
+    tracks = json.loads(tracks_file.read_text(encoding="utf-8"))["tracks"]
+    found: dict[int, list[tuple[int, np.ndarray, np.ndarray]]] = {}
+    for track in tracks:
+        for state in track["states"]:
+            mean = np.array([*state["position"], *state["velocity"]])
+            found.setdefault(state["frame"], []).append((track["id"], mean, np.array(state["covariance"])))
+    held: dict[int, int] = {}
+    switches, square, nees = 0, [], []
+    for frame, people in sorted(truth.items()):
+        there = found.get(frame, [])
+        if not there:
+            continue
+        apart = np.array([[np.linalg.norm(p[:3] - mean[:3]) for _, mean, _ in there] for p in people.values()])
+        for i, j in zip(*linear_sum_assignment(apart), strict=True):
+            if apart[i, j] > GATE_M:
+                continue
+            who, (identity, mean, cov) = list(people)[i], there[j]
+            switches += held.get(who, identity) != identity
+            held[who] = identity
+            off = mean - people[who]
+            square.append(float(off[:3] @ off[:3]))
+            nees.append(float(off @ np.linalg.solve(cov, off)))
+    total = sum(len(people) for people in truth.values())
+    return len(tracks), len(square) / total, switches, float(np.sqrt(np.mean(square))), float(np.mean(nees))
+
+
+if __name__ == "__main__":
+    main()
