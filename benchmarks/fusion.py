@@ -38,9 +38,8 @@ def main() -> None:
     print(f"{'simulated':<24} {'MSE / bound':>12} {'NEES (6 is right)':>18}")
     for method in METHODS:
         print(f"{method:<24} {found[method][0] / found['central'][0]:12.3f} {found[method][1]:18.2f}")
-    print(
-        f"\n{'rendered':<10} {'people':>7} {'tracks':>7} {'covered':>8} {'switches':>9} {'RMSE m':>8} {'NEES':>6} {'x real time':>12}"
-    )
+    names = ("rendered", "people", "tracks", "covered", "switches", "RMSE m", "NEES", "x real time")
+    print("\n{:<10} {:>7} {:>7} {:>8} {:>9} {:>8} {:>6} {:>12}".format(*names))
     totals = []
     for seed in range(args.seeds):
         with tempfile.TemporaryDirectory() as folder:
