@@ -1,0 +1,288 @@
+"""One vehicle's front: particles over its pose along the path, the patch aligned in both views, and what was measured."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from visfuse_cli.facing.settings import StereoConfig
+from visfuse_cli.maths import particles
+from visfuse_cli.maths.paths import Way
+from visfuse_cli.maths.planes import in_right, on_plane, projected, triangulated
+from visfuse_cli.records import Array, Gaussian, StereoRig
+from visfuse_cli.vision import patches
+from visfuse_cli.vision.patches import Alignment, Grey, Template
+
+S, V, LATERAL, VERTICAL, SIZE = range(5)  # of a state: arc length m, speed m/s, drift m, log size
+AGAIN = 0.55  # of the effective number: below, the particles are drawn anew
+SIGN_FRAMES = 2  # frames after which the direction of travel is decided
+TRUST = 8.0  # times an alignment's own covariance: neighbouring samples share their errors
+FLOOR_PX, FLOOR_STRETCH = 0.02, 0.0015
+
+
+@dataclass(frozen=True, slots=True)
+class Shape:
+    """The front in its own plane: corners (4, 2) m, to the right (seen along the path) and up, at log size 0."""
+
+    corners: Array
+
+    def points(self, way: Way, states: Array) -> Array:
+        """Corners (..., 4, 3) m of states (..., 5)."""
+        point, axes = way.frame(states[..., S])
+        middle = point + states[..., LATERAL, None] * axes[..., 1] + states[..., VERTICAL, None] * axes[..., 2]
+        scaled = np.exp(states[..., SIZE])[..., None, None] * self.corners
+        return np.asarray(middle[..., None, :] + scaled @ np.swapaxes(axes[..., 1:], -1, -2))
+
+
+def middle(way: Way, states: Array) -> Array:
+    """The front's middle (..., 3) m of states (..., 5)."""
+    point, axes = way.frame(states[..., S])
+    return np.asarray(point + states[..., LATERAL, None] * axes[..., 1] + states[..., VERTICAL, None] * axes[..., 2])
+
+
+def shape_of(rig: StereoRig, way: Way, quad: Array, depth: float) -> tuple[Shape, Array]:
+    """The front in a left quad (4, 2) px whose middle is `depth` (m) away, facing along the way; and its state (5,)."""
+    ray = np.append(quad.mean(axis=0), 1.0) @ np.linalg.inv(rig.left.K).T
+    place = ray * depth
+    s = way.nearest(place)
+    point, axes = way.frame(np.array(s))
+    normal = axes[:, 0]
+    corners = on_plane(rig.left.K, quad, normal, float(normal @ place))
+    # The middle of the corners in space is what is tracked.
+    place = corners.mean(axis=0)
+    off = place - point
+    state = np.array([s + off @ axes[:, 0], 0.0, off @ axes[:, 1], off @ axes[:, 2], 0.0])
+    return Shape((corners - place) @ axes[:, 1:]), state
+
+
+@dataclass(frozen=True, slots=True)
+class Looked:
+    """One frame's measurement: middle in the left view, log height there, middle in the right view (5,); noise (5, 5)."""
+
+    frame: int
+    t: float
+    z: Array
+    R: Array
+    quads: dict[str, Array]
+    correlation: float
+
+
+@dataclass(slots=True)
+class Target:
+    """A front that is followed."""
+
+    id: int
+    rig: StereoRig
+    way: Way
+    shape: Shape
+    config: StereoConfig
+    rng: np.random.Generator
+    states: Array  # (P, 5)
+    log_weights: Array
+    sought: Template
+    first: Array  # cell values of the first sight
+    reference: Array
+    t: float
+    given: bool  # named by init.yaml
+    on_path: bool
+    oriented: bool = False
+    last_seen: float = 0.0
+    looks: list[Looked] = field(default_factory=list)
+    causal: list[tuple[int, float, Gaussian, bool]] = field(default_factory=list)
+    ended_by: str = ""
+
+    @property
+    def mean(self) -> Array:
+        """The expected state (5,)."""
+        return particles.moments(self.states, self.log_weights).mean
+
+
+def start(
+    identity: int,
+    rig: StereoRig,
+    way: Way,
+    config: StereoConfig,
+    views: dict[str, list[Grey]],
+    quads: tuple[Array, Array],
+    speed: float | None,
+    at: tuple[int, float],
+    seed: int,
+    given: bool,
+    on_path: bool,
+) -> Target | None:
+    """Begin with a front seen in left and right quads (4, 2) px at (frame, t); None where it is behind the cameras."""
+    left, right = quads
+    place = triangulated(rig, left.mean(axis=0), right.mean(axis=0))
+    if not np.isfinite(place).all() or place[2] <= 0.1:
+        return None
+    shape, state = shape_of(rig, way, left, float(place[2]))
+    rng = np.random.default_rng((seed, identity))
+    count = config.filter.particles
+    states = np.tile(state, (count, 1))
+    sigma_depth = place[2] ** 2 / (rig.left.K[0, 0] * rig.baseline) * 0.5
+    depth = np.clip(rng.normal(0, sigma_depth / place[2], count), -0.5, 0.5)
+    states[:, S] += depth * place[2]
+    states[:, SIZE] = depth
+    if speed is None:
+        states[:, V] = rng.uniform(-1, 1, count) * config.filter.start_speed
+    else:
+        sign = np.where(np.arange(count) % 2 == 0, 1.0, -1.0)
+        states[:, V] = sign * (speed + rng.normal(0, config.filter.speed_share * abs(speed), count))
+    cells = patches.part_values(views["left"], left[None])[0]
+    target = Target(
+        id=identity,
+        rig=rig,
+        way=way,
+        shape=shape,
+        config=config,
+        rng=rng,
+        states=states,
+        log_weights=np.full(count, -np.log(count)),
+        sought=patches.template(views["left"], left),
+        first=cells,
+        reference=cells,
+        t=at[1],
+        given=given,
+        on_path=on_path,
+        last_seen=at[1],
+    )
+    # The given right quad says how far away the front is; where it is exactly, the pictures say.
+    seen = projected(rig.right.K, in_right(rig, shape.points(way, state)))
+    _measure(target, views, at, Alignment(np.zeros(2), np.zeros(2), np.zeros((4, 4)), 1.0), left, seen)
+    target.causal.append((*at, particles.moments(states, target.log_weights), bool(target.looks)))
+    return target
+
+
+def predict(target: Target, t: float) -> None:
+    """The particles to the time t (s): along the path by their speeds, drifting. Zhu 2012, eqs. 25-27."""
+    dt = t - target.t
+    if dt <= 0:
+        return
+    settings, states = target.config.filter, target.states
+    root = float(np.sqrt(5 * dt))  # the deviations belong to frames 0.2 s apart
+    noise = target.rng.normal(size=(len(states), 3)) * root
+    lateral, vertical = drift(target)
+    states[:, S] += states[:, V] * dt
+    states[:, V] += (settings.sigma_v or 0.15) * noise[:, 0]
+    states[:, LATERAL] += lateral * noise[:, 1]
+    states[:, VERTICAL] += vertical * noise[:, 2]
+    target.t = t
+
+
+def drift(target: Target) -> tuple[float, float]:
+    """Deviations (m a frame at 5 frames/s) across the path and up and down."""
+    settings = target.config.filter
+    if target.on_path:
+        return settings.sigma_lateral, settings.sigma_vertical
+    return settings.sigma_free, settings.sigma_free / 3
+
+
+def update(target: Target, views: dict[str, list[Grey]], at: tuple[int, float]) -> None:
+    """Weigh the particles by both views, then align the patch from where they agree."""
+    quads = _quads(target, target.states)
+    values = {view: patches.part_values(views[view], quads[view]) for view in ("left", "right")}
+    settings = target.config.observation
+    distance = sum(patches.part_distance(values[view], target.reference) for view in values)
+    across = patches.correlations(values["left"], values["right"])
+    log_likelihood = -settings.lambda_d * distance + settings.lambda_c * across  # Zhu 2012, eqs. 13, 17-18, in logs
+    bad = ~np.isfinite(quads["left"]).all(axis=(1, 2)) | ~np.isfinite(quads["right"]).all(axis=(1, 2))
+    weights = target.log_weights + np.where(bad, -1e6, log_likelihood)
+    target.log_weights = particles.normalised(weights)
+    if not target.oriented and len(target.causal) >= SIGN_FRAMES:
+        _orient(target)
+    belief = particles.moments(target.states, target.log_weights)
+    seen = _look(target, views, at, belief.mean)
+    if seen:
+        target.last_seen = at[1]
+        _take_over(target, views)
+    target.causal.append((*at, belief, seen))
+    if particles.effective_number(target.log_weights) < AGAIN * len(target.states):
+        _draw(target, target.log_weights)
+
+
+def _quads(target: Target, states: Array) -> dict[str, Array]:
+    corners = target.shape.points(target.way, states)
+    return {
+        "left": projected(target.rig.left.K, corners),
+        "right": projected(target.rig.right.K, in_right(target.rig, corners)),
+    }
+
+
+def _orient(target: Target) -> None:
+    """Decide which way the vehicle goes, by what its particles' weights say."""
+    ahead = target.states[:, V] >= 0
+    share = float(np.exp(target.log_weights[ahead]).sum())
+    keep = ahead if share >= 0.5 else ~ahead
+    _draw(target, particles.normalised(np.where(keep, target.log_weights, -1e9)))
+    target.oriented = True
+
+
+def _draw(target: Target, log_weights: Array) -> None:
+    """Draw the particles anew, a little apart from each other."""
+    index = particles.systematic(log_weights, target.rng)
+    target.log_weights = np.full(len(index), -np.log(len(index)))
+    target.states = particles.regularised(target.states[index], target.log_weights, target.rng, 0.5)
+
+
+def _look(target: Target, views: dict[str, list[Grey]], at: tuple[int, float], state: Array) -> bool:
+    """Align the patch near a state (5,) in both views; whether it was recognised."""
+    quads = _quads(target, state)
+    size = views["left"][0].shape[1], views["left"][0].shape[0]
+    if not (patches.inside(quads["left"], size) and patches.inside(quads["right"], size)):
+        return False
+    found = patches.align(views["left"], quads["left"], target.sought)
+    good = target.config.observation.good
+    if found is None or found.correlation < good:
+        return False
+    left = found.quad(quads["left"])
+    return _measure(target, views, at, found, left, quads["right"] + found.shift)
+
+
+def _measure(
+    target: Target,
+    views: dict[str, list[Grey]],
+    at: tuple[int, float],
+    found: Alignment,
+    left: Array,
+    right: Array,
+) -> bool:
+    """Align the left view's present patch in the right one, and keep what both say."""
+    present = patches.template(views["left"], left)
+    size = views["left"][0].shape[1], views["left"][0].shape[0]
+    if not patches.inside(right, size):
+        return False
+    across = patches.align(views["right"], right, present)
+    if across is None or across.correlation < target.config.observation.good:
+        return False
+    right = across.quad(right)
+    R = np.zeros((5, 5))
+    order = [0, 1, 3]
+    R[:3, :3] = TRUST * found.cov[np.ix_(order, order)] + np.diag([FLOOR_PX**2, FLOOR_PX**2, FLOOR_STRETCH**2])
+    # The right middle was found from the left one: an error of the left is shared, and the search adds its own.
+    R[3:, 3:] = R[:2, :2] + TRUST * across.cov[:2, :2] + FLOOR_PX**2 * np.eye(2)
+    R[3:, :3], R[:3, 3:] = R[:2, :3], R[:3, :2]
+    z = np.concatenate([left.mean(axis=0), [log_height(left)], right.mean(axis=0)])
+    target.looks.append(Looked(*at, z, R, {"left": left, "right": right}, found.correlation))
+    return True
+
+
+def log_height(quad: Array) -> Array:
+    """Log of the height (...) px of quads (..., 4, 2), which turning about the vertical does not change."""
+    return np.asarray(np.log(np.linalg.norm((quad[..., 2:, :] - quad[..., :2, :][..., ::-1, :]).mean(axis=-2), axis=-1)))
+
+
+def _take_over(target: Target, views: dict[str, list[Grey]]) -> None:
+    """Let the reference follow what is seen, the first one staying in it. Zhu 2012, eq. 14."""
+    settings = target.config.observation
+    fresh = patches.part_values(views["left"], target.looks[-1].quads["left"][None])[0]
+    old, first = settings.epsilon, settings.first_share
+    mixed = first * target.first + (1 - first) * (old * target.reference + (1 - old) * fresh)
+    mixed = mixed - mixed.mean()
+    target.reference = mixed / max(float(mixed.std()), 1e-3)
+
+
+def leaving(target: Target, size: tuple[int, int]) -> bool:
+    """Whether the front has left one of the pictures."""
+    quads = _quads(target, target.mean)
+    return not all(patches.inside(quads[view], size) for view in quads)
