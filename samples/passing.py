@@ -38,7 +38,9 @@ class Pass:
             return self.start + way * heading(self.course), self.course
         turned = self.course + way / self.radius
         # x' = sin(course), z' = -cos(course)
-        shift = self.radius * np.array([-np.cos(turned) + np.cos(self.course), 0, -np.sin(turned) + np.sin(self.course)])
+        shift = self.radius * np.array(
+            [-np.cos(turned) + np.cos(self.course), 0, -np.sin(turned) + np.sin(self.course)]
+        )
         return self.start + shift, turned
 
     def corners(self, t: float) -> Array:
@@ -92,7 +94,9 @@ def straight_pass(seed: int, *, mph: float | None = None, noise: float = 2.0, ra
     rate = Fraction(5)
     way = (first - last) * (1.0 if not radius else 0.95)
     n = int(way / speed * float(rate)) + 1
-    return PassScene(K, R, T, (1024, 768), (Pass(speed, start, course, radius, size, seed),), rate, n, seed, height, noise)
+    return PassScene(
+        K, R, T, (1024, 768), (Pass(speed, start, course, radius, size, seed),), rate, n, seed, height, noise
+    )
 
 
 def write_pass(scene: PassScene, out: Path, *, init: bool = True, path: bool = True, crf: int = 20) -> None:

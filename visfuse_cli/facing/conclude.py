@@ -19,6 +19,7 @@ ROUNDS = 3  # of linearisation
 GRID = np.array([0.01, 0.03, 0.1, 0.25, 0.6, 1.5, 4.0])  # m/s a frame at 5 frames/s
 USUAL, SPREAD = 0.06, 1.2  # of the deviation of speed, and of its logarithm, before anything is known
 STEP = np.array([0.01, 0.01, 0.01, 0.01, 1e-4])  # of the numerical Jacobians
+DRIFT_SPEED = 0.05  # m/s across the path
 PATH_SPEED_SHARE = 0.001  # of the speed: what the path's own direction may add
 
 
@@ -180,7 +181,7 @@ def _settled(target: Target, t: Array, smoothed: Smoothed, sigma_v: float, nis: 
     full = np.zeros((len(t), 6, 5))
     full[:, :3] = J
     full[:, 3:, V] = J[:, :, S]
-    belief = Gaussian(np.concatenate([place, velocity], axis=1), full @ cov @ np.swapaxes(full, 1, 2))
+    belief = Gaussian(np.concatenate([place, velocity], axis=1), _with_drift(full @ cov @ np.swapaxes(full, 1, 2), J))
     stretch = np.linalg.norm(J[:, :, S], axis=1)  # beside a curved path the way is longer, or shorter
     speed = np.abs(mean[:, V]) * stretch
     distance = float(np.sum(np.linalg.norm(np.diff(place, axis=0), axis=1))) if len(t) > 1 else 0.0
@@ -210,6 +211,14 @@ def _settled(target: Target, t: Array, smoothed: Smoothed, sigma_v: float, nis: 
     )
 
 
+def _with_drift(cov: Array, J: Array) -> Array:
+    """Covariances (T, 6, 6) with what is not known of the velocity across the path; J (T, 3, 5) as of `_motion`."""
+    cov = cov.copy()
+    along = J[:, :, S] / np.linalg.norm(J[:, :, S], axis=1, keepdims=True)
+    cov[:, 3:, 3:] += DRIFT_SPEED**2 * (np.eye(3) - along[:, :, None] * along[:, None, :])
+    return (cov + np.swapaxes(cov, 1, 2)) / 2
+
+
 def _motion(way: Way, states: Array) -> Array:
     """d middle / d state (T, 3, 5)."""
     tried = states[:, None, :] + np.concatenate([np.diag(STEP), -np.diag(STEP)])[None]
@@ -235,7 +244,9 @@ def _causal(target: Target, settled: Settled) -> Settled:
         settled,
         frame=[entry[0] for entry in kept],
         t=t,
-        belief=Gaussian(np.concatenate([place, velocity], axis=1), full @ cov @ np.swapaxes(full, 1, 2)),
+        belief=Gaussian(
+            np.concatenate([place, velocity], axis=1), _with_drift(full @ cov @ np.swapaxes(full, 1, 2), J)
+        ),
         speed=np.abs(states[:, V]) * stretch,
         speed_sigma=np.sqrt(cov[:, V, V]) * stretch,
         measured=np.array([entry[3] for entry in kept]),

@@ -15,7 +15,8 @@ class FilterSettings(Section):
     particles: int = Field(400, ge=20, le=100_000, description="how many poses are tried in each frame")
     path_constraint: bool = Field(True, description="true: the vehicle keeps to its path; false: it moves freely")
     kind: Literal["particles", "triangulation"] = Field(
-        "particles", description="what is measured: the aligned patch; or, for comparison, its triangulated middle alone"
+        "particles",
+        description="what is measured: the aligned patch; or, for comparison, its triangulated middle alone",
     )
     sigma_v: float | None = Field(
         None, gt=0, le=50, description="m/s a frame at 5 frames/s: change of speed; empty: told by each track itself"
@@ -33,7 +34,9 @@ class ObservationSettings(Section):
     lambda_d: float = Field(15.0, gt=0, le=1000, description="weight of the parts' distance (Zhu 2012: 15)")
     lambda_c: float = Field(20.0, gt=0, le=1000, description="weight of the correlation across views (Zhu 2012: 20)")
     epsilon: float = Field(0.3, ge=0, lt=1, description="weight of the old reference at an update (Zhu 2012: 0.3)")
-    first_share: float = Field(0.5, ge=0, le=1, description="weight that the first reference keeps, so that it cannot drift")
+    first_share: float = Field(
+        0.5, ge=0, le=1, description="weight that the first reference keeps, so that it cannot drift"
+    )
     good: float = Field(0.6, gt=0, lt=1, description="correlation from which on a patch is recognised")
 
 

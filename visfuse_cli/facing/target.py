@@ -17,13 +17,14 @@ from visfuse_cli.vision.patches import Alignment, Grey, Template
 S, V, LATERAL, VERTICAL, SIZE = range(5)  # of a state: arc length m, speed m/s, drift m, log size
 AGAIN = 0.55  # of the effective number: below, the particles are drawn anew
 SIGN_FRAMES = 2  # frames after which the direction of travel is decided
+FACING = 0.4  # cosine of the way to the line of sight from which on its front is seen
 TRUST = 8.0  # times an alignment's own covariance: neighbouring samples share their errors
 FLOOR_PX, FLOOR_STRETCH = 0.02, 0.0015
 
 
 @dataclass(frozen=True, slots=True)
 class Shape:
-    """The front in its own plane: corners (4, 2) m, to the right (seen along the path) and up, at log size 0."""
+    """The front: corners (4, 3) m along the path, to the right of it and up, from its middle, at log size 0."""
 
     corners: Array
 
@@ -32,7 +33,7 @@ class Shape:
         point, axes = way.frame(states[..., S])
         middle = point + states[..., LATERAL, None] * axes[..., 1] + states[..., VERTICAL, None] * axes[..., 2]
         scaled = np.exp(states[..., SIZE])[..., None, None] * self.corners
-        return np.asarray(middle[..., None, :] + scaled @ np.swapaxes(axes[..., 1:], -1, -2))
+        return np.asarray(middle[..., None, :] + scaled @ np.swapaxes(axes, -1, -2))
 
 
 def middle(way: Way, states: Array) -> Array:
@@ -42,18 +43,22 @@ def middle(way: Way, states: Array) -> Array:
 
 
 def shape_of(rig: StereoRig, way: Way, quad: Array, depth: float) -> tuple[Shape, Array]:
-    """The front in a left quad (4, 2) px whose middle is `depth` (m) away, facing along the way; and its state (5,)."""
+    """The front in a left quad (4, 2) px whose middle is `depth` (m) away, and its state (5,).
+
+    It faces along the way; where that is seen from the side, it faces the camera.
+    """
     ray = np.append(quad.mean(axis=0), 1.0) @ np.linalg.inv(rig.left.K).T
     place = ray * depth
     s = way.nearest(place)
     point, axes = way.frame(np.array(s))
-    normal = axes[:, 0]
+    along = axes[:, 0] @ ray / np.linalg.norm(ray)
+    normal = axes[:, 0] if abs(along) > FACING else np.array([0.0, 0.0, 1.0])
     corners = on_plane(rig.left.K, quad, normal, float(normal @ place))
     # The middle of the corners in space is what is tracked.
     place = corners.mean(axis=0)
     off = place - point
     state = np.array([s + off @ axes[:, 0], 0.0, off @ axes[:, 1], off @ axes[:, 2], 0.0])
-    return Shape((corners - place) @ axes[:, 1:]), state
+    return Shape((corners - place) @ axes), state
 
 
 @dataclass(frozen=True, slots=True)
@@ -269,7 +274,9 @@ def _measure(
 
 def log_height(quad: Array) -> Array:
     """Log of the height (...) px of quads (..., 4, 2), which turning about the vertical does not change."""
-    return np.asarray(np.log(np.linalg.norm((quad[..., 2:, :] - quad[..., :2, :][..., ::-1, :]).mean(axis=-2), axis=-1)))
+    return np.asarray(
+        np.log(np.linalg.norm((quad[..., 2:, :] - quad[..., :2, :][..., ::-1, :]).mean(axis=-2), axis=-1))
+    )
 
 
 def _take_over(target: Target, views: dict[str, list[Grey]]) -> None:
@@ -280,6 +287,11 @@ def _take_over(target: Target, views: dict[str, list[Grey]]) -> None:
     mixed = first * target.first + (1 - first) * (old * target.reference + (1 - old) * fresh)
     mixed = mixed - mixed.mean()
     target.reference = mixed / max(float(mixed.std()), 1e-3)
+
+
+def left_quad(target: Target) -> Array:
+    """Where the front is expected in the left view (4, 2) px."""
+    return _quads(target, target.mean)["left"]
 
 
 def leaving(target: Target, size: tuple[int, int]) -> bool:

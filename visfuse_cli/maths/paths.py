@@ -50,7 +50,8 @@ class Way:
         else:
             point, tangent = self._curve(inside), self._curve(inside, 1)
             tangent = tangent / np.linalg.norm(tangent, axis=-1, keepdims=True)
-        right = np.cross(tangent, np.broadcast_to(UP, tangent.shape))
+        steep = np.abs(tangent @ UP)[..., None] > 0.95  # straight up or down: the camera's axis stands for the normal
+        right = np.cross(tangent, np.where(steep, [0.0, 0.0, -1.0], UP))
         right = right / np.linalg.norm(right, axis=-1, keepdims=True)
         up = np.cross(right, tangent)
         return np.asarray(point + beyond * tangent), np.stack([tangent, right, up], axis=-1)
@@ -175,5 +176,7 @@ def through(points: Array, sigma: Array, roughness: float) -> Way:
             if gain[0] - gain[1] > roughness * (trial - degree):
                 degree = trial
     fit = np.polynomial.polynomial.polyfit(along, points, degree, w=np.sqrt(weight))
-    reach = np.linspace(along.min() - 0.02 * np.ptp(along), along.max() + 0.02 * np.ptp(along), 2 if degree == 1 else 13)
+    reach = np.linspace(
+        along.min() - 0.02 * np.ptp(along), along.max() + 0.02 * np.ptp(along), 2 if degree == 1 else 13
+    )
     return Way(np.polynomial.polynomial.polyval(reach, fit).T)

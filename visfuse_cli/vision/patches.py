@@ -38,7 +38,9 @@ def sampled(levels: list[Grey], points: Array, spacing: float) -> Grey:
     # remap's pictures end at 32767 columns: many poses go in rows of one patch each
     columns = points.shape[-2] if points.ndim > 2 else len(flat)
     maps = np.nan_to_num(flat, nan=-1e6).reshape(-1, columns, 2)
-    out = [cv2.remap(levels[level], part, None, cv2.INTER_LINEAR) for part in np.array_split(maps, -(-len(maps) // 30000))]
+    out = [
+        cv2.remap(levels[level], part, None, cv2.INTER_LINEAR) for part in np.array_split(maps, -(-len(maps) // 30000))
+    ]
     return np.concatenate(out).reshape(points.shape[:-1])
 
 
@@ -69,9 +71,7 @@ def side(quad: Array) -> tuple[float, float]:
 
 def inside(quad: Array, size: tuple[int, int], margin: float = 1.0) -> bool:
     """Whether a quad (4, 2) lies in a picture of that size."""
-    return bool(
-        np.isfinite(quad).all() and np.all(quad > margin) and np.all(quad < np.array(size) - 1 - margin)
-    )
+    return bool(np.isfinite(quad).all() and np.all(quad > margin) and np.all(quad < np.array(size) - 1 - margin))
 
 
 @dataclass(frozen=True, slots=True)
@@ -171,7 +171,9 @@ def part_values(levels: list[Grey], quads: Array) -> Array:
     In orthonormal form the distance of a part's 16 Haar-like values is that of its 16 cells. Zhu 2012, eq. 13.
     """
     unit = grid((PARTS[0] * CELLS, PARTS[1] * CELLS))
-    values = sampled(levels, warped(quads, unit), _spacing(quads[0], (PARTS[0] * CELLS, PARTS[1] * CELLS))).astype(float)
+    values = sampled(levels, warped(quads, unit), _spacing(quads[0], (PARTS[0] * CELLS, PARTS[1] * CELLS))).astype(
+        float
+    )
     values -= values.mean(axis=-1, keepdims=True)
     return np.asarray(values / np.maximum(values.std(axis=-1, keepdims=True), 1e-3))
 
