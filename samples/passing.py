@@ -1,4 +1,4 @@
-"""A vehicle's front that comes towards a static stereo pair: footage, calibration, quads, path and truth of the scene."""
+"""A vehicle's front that comes towards a static stereo pair: footage, calibration, quads, path and truth."""
 
 from __future__ import annotations
 
@@ -220,8 +220,11 @@ def _empty(scene: PassScene, side: str) -> Image:
     rng = np.random.default_rng((scene.seed, 25))
     band = rng.normal(0, 22, (high // 6, wide // 3 + 40, 3)) + 110.0
     far = cv2.resize(band.astype(np.float32), (wide + 120, high), interpolation=cv2.INTER_CUBIC)
-    shift = 60 if side == "left" else 58  # what is far away hardly moves between the views
-    picture = far[:, shift : shift + wide].copy()
+    # What is far away is seen by the right camera as if it had only turned.
+    turned = np.eye(3) if side == "left" else scene.K @ scene.R @ np.linalg.inv(scene.K)
+    move = turned @ np.array([[1, 0, -60.0], [0, 1, 0], [0, 0, 1]])
+    border = cv2.BORDER_REFLECT
+    picture = cv2.warpPerspective(far, move, scene.size, flags=cv2.INTER_LINEAR, borderMode=border)
     patches = rng.normal(0, 14, (160, 80, 1)) + 105.0
     road = cv2.resize(patches.astype(np.float32), (640, 1280), interpolation=cv2.INTER_LINEAR)
     road += rng.normal(0, 9, road.shape).astype(np.float32)

@@ -17,7 +17,7 @@ from visfuse_cli.errors import InputError
 from visfuse_cli.facing import target as front
 from visfuse_cli.facing.annotate import UNITS, Drawn, together, together_size
 from visfuse_cli.facing.conclude import conclude
-from visfuse_cli.facing.find import Finder, match
+from visfuse_cli.facing.find import Finder, Found, match
 from visfuse_cli.facing.output import track_record
 from visfuse_cli.facing.settings import StereoConfig
 from visfuse_cli.facing.target import Target
@@ -44,7 +44,7 @@ __all__ = ["StereoConfig", "run", "text"]
 
 VIEWS = ("left", "right")
 WARMUP_PICTURES = 41
-AHEAD_M = 50.0  # of a provisional way, until the track tells its own
+AHEAD_M, AHEAD_S = 50.0, 3.0  # of a provisional way, until the track tells its own
 OFF_PX, NONSENSE_PX = 2.0, 25.0  # median distance from epipolar lines: warned of, refused
 AGREE = 0.5  # of the rate's interval, within which two frames make a pair
 
@@ -251,8 +251,8 @@ def _follow(
                 begun = _begin_given(identity, given, scene, config, views, at, request.seed, run_)
                 followed += [begun] if begun is not None else []
             if finder is not None:
-                for quad in finder.look(pictures["left"], pair.t, [front.left_quad(each) for each in followed]):
-                    new = _begin_found(next_id, quad, scene, config, views, at, request.seed)
+                for found in finder.look(pictures["left"], pair.t, [front.left_quad(each) for each in followed]):
+                    new = _begin_found(next_id, found, scene, config, views, at, request.seed)
                     if new is not None:
                         followed.append(new)
                         next_id += 1
@@ -318,17 +318,29 @@ def _begin_given(
 
 def _begin_found(
     identity: int,
-    left: Array,
+    found: Found,
     scene: _Scene,
     config: StereoConfig,
     views: dict[str, list[Grey]],
     at: tuple[int, float],
     seed: int,
 ) -> Target | None:
+    """A target where something moves, along the scene's path, or along its own motion so far."""
+    left = found.quad
     right = match(scene.rig, views, left, config.observation.good)
     if right is None:
         return None
-    return _begin(identity, left, right, None, scene, config, views, at, seed, False)
+    place = triangulated(scene.rig, left.mean(axis=0), right.mean(axis=0))
+    if not np.isfinite(place).all() or place[2] <= 0.1:
+        return None
+    velocity = found.velocity(scene.rig, place)
+    speed = max(float(np.linalg.norm(velocity)), 1e-3)
+    way = scene.way if config.filter.path_constraint else None
+    if way is None:
+        way = Way(np.stack([place, place + AHEAD_S * max(speed, 0.1) * velocity / speed]))
+        return front.start(identity, scene.rig, way, config, views, (left, right), speed, at, seed, False, False)
+    along = float(way.frame(np.array(way.nearest(place)))[1][:, 0] @ velocity)
+    return front.start(identity, scene.rig, way, config, views, (left, right), along, at, seed, False, True)
 
 
 def _begin(
@@ -343,7 +355,7 @@ def _begin(
     seed: int,
     given: bool,
 ) -> Target | None:
-    """A target on the scene's path, or on one of its own: towards the camera until its track tells better."""
+    """A target on the scene's path, or on one straight at the camera until its track tells better."""
     way = scene.way if config.filter.path_constraint else None
     on_path = way is not None
     if way is None:

@@ -6,11 +6,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from visfuse_cli.facing.target import LATERAL, SIZE, VERTICAL, Looked, S, Shape, Target, V, drift, log_height, middle
+from visfuse_cli.facing.target import LATERAL, VERTICAL, Looked, S, Shape, Target, V, drift, expected, middle
 from visfuse_cli.facing.target import shape_of as front_of
 from visfuse_cli.maths import gaussian
 from visfuse_cli.maths.paths import Way, through
-from visfuse_cli.maths.planes import in_right, projected, triangulated
+from visfuse_cli.maths.planes import triangulated
 from visfuse_cli.maths.smoothing import Smoothed, cross_covariance, rauch_tung_striebel
 from visfuse_cli.records import Array, Gaussian, StereoRig
 
@@ -49,9 +49,9 @@ class Settled:
 
 
 def conclude(target: Target) -> Settled | None:
-    """Settle a track; None where it was measured in too few frames, or did not move though it was found unaided."""
+    """Settle a track; None where it was measured in too few frames, or found unaided and did not move."""
     life = target.config.life
-    if len(target.looks) < life.min_frames:
+    if len(target.looks) < max(life.min_frames, life.min_share * len(target.causal)):
         return None
     if not target.on_path and target.config.filter.path_constraint:
         target = _with_way(target)
@@ -155,17 +155,7 @@ def _rows(target: Target, look: Looked) -> list[int]:
 def _expected(rig: StereoRig, way: Way, shape: Shape, states: Array) -> tuple[Array, Array]:
     """What would be measured (T, 5) at states (T, 5), and the Jacobians (T, 5, 5), by central differences."""
     tried = states[:, None, :] + np.concatenate([np.zeros((1, 5)), np.diag(STEP), -np.diag(STEP)])[None]
-    corners = shape.points(way, tried)
-    left = projected(rig.left.K, corners)
-    centre = middle(way, tried)
-    z = np.concatenate(
-        [
-            projected(rig.left.K, centre),
-            log_height(left)[..., None],
-            projected(rig.right.K, in_right(rig, centre)),
-        ],
-        axis=-1,
-    )
+    z = expected(rig, way, shape, tried)
     H = (z[:, 1:6] - z[:, 6:11]) / (2 * STEP[None, :, None])
     return z[:, 0], np.swapaxes(H, 1, 2)
 

@@ -25,7 +25,23 @@ MEMORY_S, SHADOW = 60.0, 0.5
 class _Candidate:
     box: Array  # [u0, v0, u1, v1] px
     first: Array
+    first_t: float
     seen: int = 1
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """A region that moves: its left quad (4, 2) px, how fast its middle moves (2,) px/s, and its growth (1/s)."""
+
+    quad: Array
+    motion: Array
+    growth: float
+
+    def velocity(self, rig: StereoRig, place: Array) -> Array:
+        """Velocity (3,) m/s of what stands at a place (3,) m."""
+        away = -self.growth * place[2]
+        across = self.motion / np.diag(rig.left.K)[:2] * place[2]
+        return np.array([across[0], across[1], 0.0]) + away * place / place[2]
 
 
 class Finder:
@@ -37,8 +53,8 @@ class Finder:
         self._background.start(empty)
         self._candidates: list[_Candidate] = []
 
-    def look(self, picture: Image, t: float, known: list[Array]) -> list[Array]:
-        """Left quads (4, 2) px of regions that have moved for some frames, away from quads that are `known`."""
+    def look(self, picture: Image, t: float, known: list[Array]) -> list[Found]:
+        """Regions that have moved for some frames, away from quads that are `known`."""
         boxes = self._regions(picture)
         held = [np.concatenate([quad.min(axis=0), quad.max(axis=0)]) for quad in known]
         boxes = [box for box in boxes if not any(_shared(box, other) > OVERLAP for other in held)]
@@ -47,12 +63,12 @@ class Finder:
         for box in boxes:
             before = next((c for c in self._candidates if _near(c.box, box)), None)
             if before is None:
-                kept.append(_Candidate(box, box))
+                kept.append(_Candidate(box, box, t))
             else:
-                kept.append(_Candidate(box, before.first, before.seen + 1))
+                kept.append(_Candidate(box, before.first, before.first_t, before.seen + 1))
         ready = [c for c in kept if c.seen >= self._config.detection.confirm_frames + 1 and _moved(c)]
         self._candidates = [c for c in kept if not any(c is other for other in ready)]
-        return [self._quad(c.box) for c in ready]
+        return [self._found(c, t) for c in ready]
 
     def _regions(self, picture: Image) -> list[Array]:
         """Boxes [u0, v0, u1, v1] of what moves and lies whole in the picture."""
@@ -69,6 +85,13 @@ class Finder:
             if min(w, h) >= least and area > 0.4 * w * h and whole:
                 found.append(np.array([x - 0.5, y - 0.5, x + w - 0.5, y + h - 0.5]))
         return found
+
+    def _found(self, candidate: _Candidate, t: float) -> Found:
+        dt = t - candidate.first_t
+        old, new = candidate.first, candidate.box
+        moved = ((new[:2] + new[2:]) - (old[:2] + old[2:])) / 2
+        grown = 0.5 * float(np.log(np.prod(new[2:] - new[:2]) / np.prod(old[2:] - old[:2])))
+        return Found(self._quad(new), moved / dt, grown / dt)
 
     def _quad(self, box: Array) -> Array:
         """The corners of a region less its rim, where background shows."""

@@ -23,7 +23,7 @@ class FilterSettings(Section):
     )
     sigma_lateral: float = Field(0.10, gt=0, le=10, description="m a frame at 5 frames/s: drift across the path")
     sigma_vertical: float = Field(0.03, gt=0, le=10, description="m a frame at 5 frames/s: drift up and down")
-    sigma_free: float = Field(1.5, gt=0, le=50, description="m a frame at 5 frames/s: both, without a path")
+    free_share: float = Field(0.2, gt=0, le=5, description="drift without a path, as a share of the way in a frame")
     start_speed: float = Field(20.0, gt=0, le=200, description="m/s: speeds tried where none is given")
     speed_share: float = Field(0.15, gt=0, le=1, description="how far a given speed may be off, as a share of it")
 
@@ -55,6 +55,7 @@ class LifeSettings(Section):
 
     max_coast_s: float = Field(0.8, ge=0, le=60, description="s without a recognised patch before a track ends")
     min_frames: int = Field(4, ge=2, le=1000, description="measured frames that a track needs")
+    min_share: float = Field(0.5, ge=0, le=1, description="share of its frames in which a track must be measured")
     min_distance: float = Field(0.2, ge=0, le=1000, description="m that a vehicle found unaided must move")
 
 

@@ -17,8 +17,11 @@ from visfuse_cli.vision.patches import Alignment, Grey, Template
 S, V, LATERAL, VERTICAL, SIZE = range(5)  # of a state: arc length m, speed m/s, drift m, log size
 AGAIN = 0.55  # of the effective number: below, the particles are drawn anew
 SIGN_FRAMES = 2  # frames after which the direction of travel is decided
+FOUND_SHARE = 0.4  # how far the speed of what was found unaided may be off
 FACING = 0.4  # cosine of the way to the line of sight from which on its front is seen
 TRUST = 8.0  # times an alignment's own covariance: neighbouring samples share their errors
+TEMPER = 4.0
+BLUR_PX, BLUR_STRETCH = 0.3, 0.01
 FLOOR_PX, FLOOR_STRETCH = 0.02, 0.0015
 
 
@@ -40,6 +43,19 @@ def middle(way: Way, states: Array) -> Array:
     """The front's middle (..., 3) m of states (..., 5)."""
     point, axes = way.frame(states[..., S])
     return np.asarray(point + states[..., LATERAL, None] * axes[..., 1] + states[..., VERTICAL, None] * axes[..., 2])
+
+
+def expected(rig: StereoRig, way: Way, shape: Shape, states: Array) -> Array:
+    """What would be measured (..., 5) of states (..., 5): as in `Looked`."""
+    centre = middle(way, states)
+    return np.concatenate(
+        [
+            projected(rig.left.K, centre),
+            log_height(projected(rig.left.K, shape.points(way, states)))[..., None],
+            projected(rig.right.K, in_right(rig, centre)),
+        ],
+        axis=-1,
+    )
 
 
 def shape_of(rig: StereoRig, way: Way, quad: Array, depth: float) -> tuple[Shape, Array]:
@@ -91,6 +107,7 @@ class Target:
     t: float
     given: bool  # named by init.yaml
     on_path: bool
+    free_drift: float  # m a frame at 5 frames/s: drift where there is no path
     oriented: bool = False
     last_seen: float = 0.0
     looks: list[Looked] = field(default_factory=list)
@@ -131,6 +148,8 @@ def start(
     states[:, SIZE] = depth
     if speed is None:
         states[:, V] = rng.uniform(-1, 1, count) * config.filter.start_speed
+    elif not given:
+        states[:, V] = speed * (1 + FOUND_SHARE * rng.normal(size=count))
     else:
         sign = np.where(np.arange(count) % 2 == 0, 1.0, -1.0)
         states[:, V] = sign * (speed + rng.normal(0, config.filter.speed_share * abs(speed), count))
@@ -150,6 +169,8 @@ def start(
         t=at[1],
         given=given,
         on_path=on_path,
+        free_drift=config.filter.free_share * 0.2 * abs(speed or config.filter.start_speed),
+        oriented=speed is not None and not given,
         last_seen=at[1],
     )
     # The given right quad says how far away the front is; where it is exactly, the pictures say.
@@ -180,7 +201,7 @@ def drift(target: Target) -> tuple[float, float]:
     settings = target.config.filter
     if target.on_path:
         return settings.sigma_lateral, settings.sigma_vertical
-    return settings.sigma_free, settings.sigma_free / 3
+    return target.free_drift, target.free_drift / 2
 
 
 def update(target: Target, views: dict[str, list[Grey]], at: tuple[int, float]) -> None:
@@ -196,11 +217,12 @@ def update(target: Target, views: dict[str, list[Grey]], at: tuple[int, float]) 
     target.log_weights = particles.normalised(weights)
     if not target.oriented and len(target.causal) >= SIGN_FRAMES:
         _orient(target)
-    belief = particles.moments(target.states, target.log_weights)
-    seen = _look(target, views, at, belief.mean)
+    seen = _look(target, views, at)
     if seen:
         target.last_seen = at[1]
+        _pull(target)
         _take_over(target, views)
+    belief = particles.moments(target.states, target.log_weights)
     target.causal.append((*at, belief, seen))
     if particles.effective_number(target.log_weights) < AGAIN * len(target.states):
         _draw(target, target.log_weights)
@@ -230,18 +252,51 @@ def _draw(target: Target, log_weights: Array) -> None:
     target.states = particles.regularised(target.states[index], target.log_weights, target.rng, 0.5)
 
 
-def _look(target: Target, views: dict[str, list[Grey]], at: tuple[int, float], state: Array) -> bool:
-    """Align the patch near a state (5,) in both views; whether it was recognised."""
-    quads = _quads(target, state)
+def _look(target: Target, views: dict[str, list[Grey]], at: tuple[int, float]) -> bool:
+    """Align the patch in both views, from where the particles and where its own motion put it; whether it was seen."""
     size = views["left"][0].shape[1], views["left"][0].shape[0]
-    if not (patches.inside(quads["left"], size) and patches.inside(quads["right"], size)):
+    best: tuple[Alignment, Array] | None = None
+    for quad in (left_quad(target), _continued(target, at[1])):
+        if quad is None or not patches.inside(quad, size):
+            continue
+        found = patches.align(views["left"], quad, target.sought)
+        if found is not None and (best is None or found.correlation > best[0].correlation):
+            best = (found, found.quad(quad))
+    if best is None or best[0].correlation < target.config.observation.good:
         return False
-    found = patches.align(views["left"], quads["left"], target.sought)
-    good = target.config.observation.good
-    if found is None or found.correlation < good:
-        return False
-    left = found.quad(quads["left"])
-    return _measure(target, views, at, found, left, quads["right"] + found.shift)
+    return _measure(target, views, at, *best, _right_of(target, best[1]))
+
+
+def _continued(target: Target, t: float) -> Array | None:
+    """The left quad if shift and growth go on as between the last two looks; None where there are fewer."""
+    if len(target.looks) < 2:
+        return None
+    before, last = target.looks[-2:]
+    share = (t - last.t) / (last.t - before.t)
+    growth = np.exp(np.clip(share * (last.z[2] - before.z[2]), -0.5, 0.5))
+    moved = last.z[:2] + share * (last.z[:2] - before.z[:2])
+    return np.asarray(moved + growth * (last.quads["left"] - last.z[:2]))
+
+
+def _right_of(target: Target, left: Array) -> Array:
+    """Where the right view should show a left quad (4, 2): as much nearer than at the last look as it has grown."""
+    rig, last = target.rig, target.looks[-1] if target.looks else None
+    depth = target.shape.points(target.way, target.mean)[:, 2]
+    if last is not None:
+        before = triangulated(rig, last.z[:2], last.z[3:])[2]
+        depth = depth / depth.mean() * before * np.exp(last.z[2] - log_height(left))
+    rays = np.column_stack([left, np.ones(4)]) @ np.linalg.inv(rig.left.K).T
+    return projected(rig.right.K, in_right(rig, rays * depth[:, None]))
+
+
+def _pull(target: Target) -> None:
+    """Weigh the particles by the latest measurement too, tempered: the parts have seen the same pixels already."""
+    look = target.looks[-1]
+    residual = look.z - expected(target.rig, target.way, target.shape, target.states)
+    spread = TEMPER * look.R + np.diag([BLUR_PX**2, BLUR_PX**2, BLUR_STRETCH**2, BLUR_PX**2, BLUR_PX**2])
+    distance = np.einsum("pi,ij,pj->p", residual, np.linalg.inv(spread), residual)
+    distance = np.where(np.isfinite(distance), distance, 1e6)
+    target.log_weights = particles.normalised(target.log_weights - 0.5 * distance)
 
 
 def _measure(
