@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from visfuse_cli.facing.target import LATERAL, VERTICAL, Looked, S, Shape, Target, V, drift, expected, middle
+from visfuse_cli.facing.target import LATERAL, VERTICAL, S, Shape, Target, V, drift, expected, middle
 from visfuse_cli.facing.target import shape_of as front_of
 from visfuse_cli.maths import gaussian
 from visfuse_cli.maths.paths import Way, through
@@ -16,6 +16,9 @@ from visfuse_cli.records import Array, Gaussian, StereoRig
 
 Z95 = 1.959963984540054
 ROUNDS = 3  # of linearisation
+SHOWN = 0.2  # of its own height, or of the logarithm of it: what a moving thing changes in the picture
+ALIKE = 0.8  # median correlation
+SHARED_S = 0.2  # s for which the patch errs alike: pictures nearer in time do not add to each other
 GRID = np.array([0.01, 0.03, 0.1, 0.25, 0.6, 1.5, 4.0])  # m/s a frame at 5 frames/s
 USUAL, SPREAD = 0.06, 1.2  # of the deviation of speed, and of its logarithm, before anything is known
 STEP = np.array([0.01, 0.01, 0.01, 0.01, 1e-4])  # of the numerical Jacobians
@@ -58,9 +61,20 @@ def conclude(target: Target) -> Settled | None:
     t = np.array([look.t for look in target.looks])
     sigma_v, smoothed, nis = _best(target, t)
     settled = _settled(target, t, smoothed, sigma_v, nis)
-    if not target.given and settled.distance < life.min_distance:
+    if not target.given and not _moved(target, settled):
         return None
     return settled if target.config.smooth else _causal(target, settled)
+
+
+def _moved(target: Target, settled: Settled) -> bool:
+    """Whether what was found unaided went anywhere, in space and in the picture, and looked like itself all the way."""
+    place = settled.belief.mean[:, :3]
+    net = float(np.linalg.norm(place[-1] - place[0]))
+    first, last = target.looks[0].z, target.looks[-1].z
+    size = np.exp(first[2])
+    shown = max(float(np.linalg.norm(last[:2] - first[:2])) / size, abs(float(last[2] - first[2])))
+    alike = float(np.median([look.correlation for look in target.looks]))
+    return net > target.config.life.min_distance and shown > SHOWN and alike > ALIKE
 
 
 def _with_way(target: Target) -> Target:
@@ -84,7 +98,11 @@ def _best(target: Target, t: Array) -> tuple[float, Smoothed, float]:
         return asked, smoothed, nis
     score = []
     for sigma in GRID:
-        _, likelihood, _ = _smoothed(target, t, float(sigma))
+        _, likelihood, nis = _smoothed(target, t, float(sigma))
+        # Were the noise what the innovations say it is, this would be the likelihood.
+        freedom = len(_rows(target)) * max(len(t) - 2, 1)
+        if nis > 1:
+            likelihood += 0.5 * freedom * (nis - 1 - np.log(nis))
         score.append(likelihood - 0.5 * (np.log(sigma / USUAL) / SPREAD) ** 2)
     weight = np.exp(np.array(score) - max(score))
     sigma = float(np.exp(np.sum(weight * np.log(GRID)) / weight.sum()))
@@ -123,6 +141,7 @@ def _pass(target: Target, t: Array, sigma_v: float, about: Array) -> tuple[Smoot
     belief = prior
     filtered, predicted, transitions = [], [], []
     likelihood, nis, freedom = 0.0, 0.0, 0
+    shared = max(1.0, SHARED_S / float(np.median(np.diff(t)))) if len(t) > 1 else 1.0
     for k, look in enumerate(target.looks):
         dt = float(t[k] - t[k - 1]) if k else 0.0
         F = np.eye(5)
@@ -133,9 +152,10 @@ def _pass(target: Target, t: Array, sigma_v: float, about: Array) -> tuple[Smoot
         Q[LATERAL, LATERAL], Q[VERTICAL, VERTICAL] = 5 * dt * lateral**2, 5 * dt * vertical**2
         Q += 1e-12 * np.eye(5)
         ahead = gaussian.predict(belief, F, Q) if k else prior
-        rows = _rows(target, look)
+        rows = _rows(target)
         residual = look.z - h[k] - H[k] @ (ahead.mean - about[k])
-        belief, innovation = gaussian.update(ahead, residual[rows], H[k][rows], look.R[np.ix_(rows, rows)])
+        R = shared * look.R[np.ix_(rows, rows)]
+        belief, innovation = gaussian.update(ahead, residual[rows], H[k][rows], R)
         if k > 1:
             likelihood += float(innovation.log_likelihood)
             nis, freedom = nis + float(innovation.nis), freedom + len(rows)
@@ -146,9 +166,8 @@ def _pass(target: Target, t: Array, sigma_v: float, about: Array) -> tuple[Smoot
     return rauch_tung_striebel(*stack, np.stack(transitions)), likelihood, nis / max(freedom, 1)
 
 
-def _rows(target: Target, look: Looked) -> list[int]:
+def _rows(target: Target) -> list[int]:
     """Which components are used: with `triangulation`, for comparison, the two middles alone."""
-    del look
     return [0, 1, 3, 4] if target.config.filter.kind == "triangulation" else [0, 1, 2, 3, 4]
 
 

@@ -18,6 +18,7 @@ NEAREST, STEPS = 1.0, 1200  # m; most depths that are tried
 STEP_PX = 0.5  # of disparity, between them
 OVERLAP = 0.2  # share of a region that a vehicle which is followed already may hold
 LEAST_MOVE = 0.02  # of its size, that a region must have moved or grown
+DENSE = 0.6  # share of the fullest row or column
 MEMORY_S, SHADOW = 60.0, 0.5
 
 
@@ -83,7 +84,9 @@ class Finder:
         for x, y, w, h, area in blobs[1:]:
             whole = x > 1 and y > 1 and x + w < wide - 1 and y + h < high - 1
             if min(w, h) >= least and area > 0.4 * w * h and whole:
-                found.append(np.array([x - 0.5, y - 0.5, x + w - 0.5, y + h - 0.5]))
+                box = _dense(mask[y : y + h, x : x + w]) + [x, y, x, y]
+                if np.all(box[2:] - box[:2] >= least):
+                    found.append(box)
         return found
 
     def _found(self, candidate: _Candidate, t: float) -> Found:
@@ -117,6 +120,16 @@ def match(rig: StereoRig, views: dict[str, list[Grey]], left: Array, good: float
     score = patches.correlations(patches.part_values(views["right"], quads), here)
     best = int(np.argmax(score))
     return np.asarray(quads[best]) if score[best] > good else None
+
+
+def _dense(mask: Image) -> Array:
+    """The box [u0, v0, u1, v1] of those rows and columns of a region that are well filled: without shadows' ends."""
+    ends = []
+    for axis in (0, 1):
+        filled = np.count_nonzero(mask, axis=axis)
+        good = np.flatnonzero(filled >= DENSE * filled.max())
+        ends.append((good[0] - 0.5, good[-1] + 0.5))
+    return np.array([ends[0][0], ends[1][0], ends[0][1], ends[1][1]])
 
 
 def _corners(box: Array) -> Array:

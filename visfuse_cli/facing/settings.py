@@ -37,6 +37,9 @@ class ObservationSettings(Section):
     first_share: float = Field(
         0.5, ge=0, le=1, description="weight that the first reference keeps, so that it cannot drift"
     )
+    fresh: float = Field(
+        0.9, gt=0, lt=1, description="correlation below which the patch is taken anew: it has turned since"
+    )
     good: float = Field(0.6, gt=0, lt=1, description="correlation from which on a patch is recognised")
 
 

@@ -20,6 +20,7 @@ SIGN_FRAMES = 2  # frames after which the direction of travel is decided
 FOUND_SHARE = 0.4  # how far the speed of what was found unaided may be off
 FACING = 0.4  # cosine of the way to the line of sight from which on its front is seen
 TRUST = 8.0  # times an alignment's own covariance: neighbouring samples share their errors
+STRAYED = 60.0  # squared deviations of the best particle from the patch that was found
 TEMPER = 4.0
 BLUR_PX, BLUR_STRETCH = 0.3, 0.01
 FLOOR_PX, FLOOR_STRETCH = 0.02, 0.0015
@@ -222,6 +223,8 @@ def update(target: Target, views: dict[str, list[Grey]], at: tuple[int, float]) 
         target.last_seen = at[1]
         _pull(target)
         _take_over(target, views)
+        if target.looks[-1].correlation < target.config.observation.fresh:
+            target.sought = patches.template(views["left"], target.looks[-1].quads["left"])
     belief = particles.moments(target.states, target.log_weights)
     target.causal.append((*at, belief, seen))
     if particles.effective_number(target.log_weights) < AGAIN * len(target.states):
@@ -273,9 +276,26 @@ def _continued(target: Target, t: float) -> Array | None:
         return None
     before, last = target.looks[-2:]
     share = (t - last.t) / (last.t - before.t)
-    growth = np.exp(np.clip(share * (last.z[2] - before.z[2]), -0.5, 0.5))
+    tall = np.exp(last.z[2] + np.clip(share * (last.z[2] - before.z[2]), -0.5, 0.5))
     moved = last.z[:2] + share * (last.z[:2] - before.z[:2])
-    return np.asarray(moved + growth * (last.quads["left"] - last.z[:2]))
+    usual = left_quad(target)
+    return np.asarray(moved + tall / np.exp(log_height(usual)) * (usual - usual.mean(axis=0)))
+
+
+def _gather(target: Target) -> None:
+    """Put particles that have strayed where the patch was found, at the speed between the last two looks."""
+    rig, way, look = target.rig, target.way, target.looks[-1]
+    points = [triangulated(rig, each.z[:2], each.z[3:]) for each in target.looks[-2:]]
+    s = [way.nearest(point) for point in points]
+    place, axes = way.frame(np.array(s[-1]))
+    off = (points[-1] - place) @ axes
+    state = np.array([s[-1], 0.0, off[1], off[2], float(np.mean(target.states[:, SIZE]))])
+    state[SIZE] += look.z[2] - expected(rig, way, target.shape, state)[2]
+    if len(s) > 1:
+        state[V] = (s[-1] - s[0]) / (look.t - target.looks[-2].t)
+    sigma = np.array([0.01 * points[-1][2], 0.2 * abs(state[V]), 0.002 * points[-1][2], 0.002 * points[-1][2], 0.01])
+    target.states = state + sigma * target.rng.normal(size=target.states.shape)
+    target.log_weights = np.full(len(target.states), -np.log(len(target.states)))
 
 
 def _right_of(target: Target, left: Array) -> Array:
@@ -296,6 +316,9 @@ def _pull(target: Target) -> None:
     spread = TEMPER * look.R + np.diag([BLUR_PX**2, BLUR_PX**2, BLUR_STRETCH**2, BLUR_PX**2, BLUR_PX**2])
     distance = np.einsum("pi,ij,pj->p", residual, np.linalg.inv(spread), residual)
     distance = np.where(np.isfinite(distance), distance, 1e6)
+    if distance.min() > STRAYED:
+        _gather(target)
+        return
     target.log_weights = particles.normalised(target.log_weights - 0.5 * distance)
 
 
