@@ -17,10 +17,12 @@ MAY_IMPORT = {
     "config": {"records", "errors"},
     "files": {"maths", "config", "records", "errors"},
     "tracking": {"vision", "maths", "config", "records", "errors"},
+    "facing": {"vision", "maths", "config", "records", "errors"},
     "pipeline": {"tracking", "vision", "maths", "files", "records", "errors"},
     "commands": {
         "pipeline",
         "tracking",
+        "facing",
         "vision",
         "maths",
         "files",

@@ -193,7 +193,8 @@ def _way(path: Path, given: GivenPath, rig: StereoRig) -> Way:
     try:
         if given.points is not None:
             return Way(given.points)
-        assert given.left is not None and given.right is not None
+        assert given.left is not None
+        assert given.right is not None
         left, right = undistort_points(given.left, rig.left), undistort_points(given.right, rig.right)
         return paths.straight(rig, left, right) if len(left) == 2 else paths.curved(rig, left, right)
     except ValueError as problem:

@@ -162,8 +162,11 @@ def _pass(target: Target, t: Array, sigma_v: float, about: Array) -> tuple[Smoot
         filtered.append(belief)
         predicted.append(ahead)
         transitions.append(F)
-    stack = [Gaussian(np.stack([b.mean for b in bs]), np.stack([b.cov for b in bs])) for bs in (filtered, predicted)]
-    return rauch_tung_striebel(*stack, np.stack(transitions)), likelihood, nis / max(freedom, 1)
+    after, before = (
+        Gaussian(np.stack([b.mean for b in beliefs]), np.stack([b.cov for b in beliefs]))
+        for beliefs in (filtered, predicted)
+    )
+    return rauch_tung_striebel(after, before, np.stack(transitions)), likelihood, nis / max(freedom, 1)
 
 
 def _rows(target: Target) -> list[int]:

@@ -1,4 +1,4 @@
-"""One vehicle's front: particles over its pose along the path, the patch aligned in both views, and what was measured."""
+"""One vehicle's front: particles over its pose along the path, the patch aligned in both views, what was measured."""
 
 from __future__ import annotations
 
@@ -21,6 +21,7 @@ FOUND_SHARE = 0.4  # how far the speed of what was found unaided may be off
 FACING = 0.4  # cosine of the way to the line of sight from which on its front is seen
 TRUST = 8.0  # times an alignment's own covariance: neighbouring samples share their errors
 STRAYED = 60.0  # squared deviations of the best particle from the patch that was found
+ACROSS_STRETCH = 0.03  # what a front that is not quite flat, or not quite so turned, differs by across the views
 TEMPER = 4.0
 BLUR_PX, BLUR_STRETCH = 0.3, 0.01
 FLOOR_PX, FLOOR_STRETCH = 0.02, 0.0015
@@ -70,7 +71,7 @@ def shape_of(rig: StereoRig, way: Way, quad: Array, depth: float) -> tuple[Shape
     point, axes = way.frame(np.array(s))
     along = axes[:, 0] @ ray / np.linalg.norm(ray)
     normal = axes[:, 0] if abs(along) > FACING else np.array([0.0, 0.0, 1.0])
-    corners = on_plane(rig.left.K, quad, normal, float(normal @ place))
+    corners = on_plane(rig.left.K, quad, normal, np.asarray(normal @ place))
     # The middle of the corners in space is what is tracked.
     place = corners.mean(axis=0)
     off = place - point
@@ -80,7 +81,7 @@ def shape_of(rig: StereoRig, way: Way, quad: Array, depth: float) -> tuple[Shape
 
 @dataclass(frozen=True, slots=True)
 class Looked:
-    """One frame's measurement: middle in the left view, log height there, middle in the right view (5,); noise (5, 5)."""
+    """One frame's measurement (5,): middle in the left view, log height there, middle in the right; noise (5, 5)."""
 
     frame: int
     t: float
@@ -335,7 +336,7 @@ def _measure(
     size = views["left"][0].shape[1], views["left"][0].shape[0]
     if not patches.inside(right, size):
         return False
-    across = patches.align(views["right"], right, present)
+    across = patches.align(views["right"], right, present, ACROSS_STRETCH)
     if across is None or across.correlation < target.config.observation.good:
         return False
     right = across.quad(right)

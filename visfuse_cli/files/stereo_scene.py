@@ -1,4 +1,4 @@
-"""What a stereo scene says of its targets and their path: init.yaml and path.yaml, in undistorted left pixels or metres."""
+"""What a stereo scene says of its targets and their path: init.yaml and path.yaml, in footage pixels or metres."""
 
 from __future__ import annotations
 

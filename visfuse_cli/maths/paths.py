@@ -89,8 +89,9 @@ def straight(rig: StereoRig, left: Array, right: Array) -> Way:
     for ray in rays:
         A = np.column_stack([ray, -k])
         depth, along = np.linalg.lstsq(A, point, rcond=None)[0]
-        ends.append(point + along * k if depth > 0 else None)
-    if ends[0] is None or ends[1] is None or np.linalg.norm(ends[1] - ends[0]) < 1e-3:
+        if depth > 0:
+            ends.append(point + along * k)
+    if len(ends) < 2 or np.linalg.norm(ends[1] - ends[0]) < 1e-3:
         raise ValueError("the path lies behind the cameras")
     return Way(np.stack(ends))
 
@@ -135,7 +136,7 @@ def curved(rig: StereoRig, left: Array, right: Array) -> Way:
     assert best is not None
     if np.sqrt(np.mean(off(best.x)[:SAMPLES] ** 2)) > 3.0 or np.any(basis @ best.x < 1e-4):
         raise ValueError("the two images of the path do not fit one curve before both cameras")
-    return Way(points(best.x)[:: SAMPLES // 12])
+    return Way(points(best.x)[np.linspace(0, SAMPLES - 1, 13).astype(int)])
 
 
 def _resampled(line: Array) -> Array:
@@ -157,7 +158,7 @@ def _to_polyline(points: Array, line: Array) -> Array:
 
 
 def through(points: Array, sigma: Array, roughness: float) -> Way:
-    """The smooth way past noisy points (n, 3) m in order of time, deviations sigma (n,): straight if that explains them."""
+    """The smooth way past noisy points (n, 3) m in order of time, deviations sigma (n,); straight if that does."""
     weight = 1 / sigma**2
     middle = (weight @ points) / weight.sum()
     _, _, axes = np.linalg.svd((points - middle) * np.sqrt(weight)[:, None], full_matrices=False)
@@ -179,4 +180,4 @@ def through(points: Array, sigma: Array, roughness: float) -> Way:
     reach = np.linspace(
         along.min() - 0.02 * np.ptp(along), along.max() + 0.02 * np.ptp(along), 2 if degree == 1 else 13
     )
-    return Way(np.polynomial.polynomial.polyval(reach, fit).T)
+    return Way(np.asarray(np.polynomial.polynomial.polyval(reach, fit).T, dtype=float))

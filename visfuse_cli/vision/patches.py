@@ -17,6 +17,7 @@ LEVELS = 5
 ROUNDS = 20
 FEWEST, MOST = 10, 72  # samples along a side of a patch that is aligned
 HUBER = 2.5
+LONGEST = 30000  # rows of a picture that remap makes
 RIM_PX = 0.5  # px inside of a quad at which its patch begins: beyond its edge lies something else
 
 
@@ -35,12 +36,11 @@ def sampled(levels: list[Grey], points: Array, spacing: float) -> Grey:
     level = int(np.clip(np.floor(np.log2(max(spacing, 1.0)) + 0.3), 0, len(levels) - 1))
     at = (points / 2**level).astype(np.float32)
     flat = np.ascontiguousarray(at.reshape(-1, 2))
-    # remap's pictures end at 32767 columns: many poses go in rows of one patch each
+    # One row of the picture that is made for each pose.
     columns = points.shape[-2] if points.ndim > 2 else len(flat)
     maps = np.nan_to_num(flat, nan=-1e6).reshape(-1, columns, 2)
-    out = [
-        cv2.remap(levels[level], part, None, cv2.INTER_LINEAR) for part in np.array_split(maps, -(-len(maps) // 30000))
-    ]
+    pieces = np.array_split(maps, -(-len(maps) // LONGEST))
+    out = [cv2.remap(levels[level], piece, None, cv2.INTER_LINEAR) for piece in pieces]
     return np.concatenate(out).reshape(points.shape[:-1])
 
 
@@ -118,16 +118,19 @@ class Alignment:
         return np.asarray(middle + self.shift + np.exp(self.stretch) * (quad - middle))
 
 
-def align(levels: list[Grey], quad: Array, sought: Template, stretch: bool = True) -> Alignment | None:
-    """Find a template near a quad (4, 2) by Gauss-Newton on grey values, gain and offset free; None where it is lost."""
+def align(levels: list[Grey], quad: Array, sought: Template, stretch_sigma: float = np.inf) -> Alignment | None:
+    """Find a template near a quad (4, 2) by Gauss-Newton on grey values, gain and offset free; None where it is lost.
+
+    The log stretch is believed to be zero but for `stretch_sigma`.
+    """
     points = warped(quad, sought.unit)
     middle = quad.mean(axis=0)
     spacing = _spacing(quad, _count(sought.unit))
     p = np.zeros(4)
-    free = np.array([True, True, stretch, stretch])
     reach = max(3.0, 0.25 * min(side(quad)))
     A, weight, left = np.zeros((4, 4)), np.ones(len(points)), np.zeros(len(points))
     correlation, h = 0.0, max(0.5, spacing / 2)
+    gain, noise2 = 1.0, 1.0
     for _ in range(ROUNDS):
         away = points - middle
         at = middle + p[:2] + np.exp(p[2:]) * away
@@ -139,30 +142,32 @@ def align(levels: list[Grey], quad: Array, sought: Template, stretch: bool = Tru
             return None
         gx, gy = (values[1] - values[2]) / (2 * h), (values[3] - values[4]) / (2 * h)
         scaled = np.exp(p[2:]) * away
-        J = np.column_stack([gx, gy, gx * scaled[:, 0], gy * scaled[:, 1]])[:, free]
+        J = np.column_stack([gx, gy, gx * scaled[:, 0], gy * scaled[:, 1]])
         X = np.column_stack([J, now, np.ones(len(now))])
         # template = a I(x(p)) + b: linear in gain and offset, so they are solved with the step
         W = weight[:, None] * X
-        solution = np.linalg.lstsq(W.T @ X + 1e-9 * np.eye(X.shape[1]), W.T @ sought.values, rcond=None)[0]
-        gain = solution[-2]
+        normal, known = W.T @ X + 1e-9 * np.eye(6), W.T @ sought.values
+        pull = noise2 / (gain**2 * stretch_sigma**2)  # of the prior, on gain times stretch
+        normal[[2, 3], [2, 3]] += pull
+        known[2:4] -= pull * gain * p[2:]
+        solution = np.linalg.lstsq(normal, known, rcond=None)[0]
+        gain = float(solution[-2])
         if gain <= 0.05:
             return None
         left = sought.values - X @ solution
         scale = 1.4826 * float(np.median(np.abs(left))) + 1e-6
+        noise2 = scale**2
         weight = np.minimum(1.0, HUBER * scale / np.maximum(np.abs(left), 1e-9))
-        step = np.zeros(4)
-        step[free] = solution[: int(free.sum())] / gain
+        step = solution[:4] / gain
         p = p + np.clip(step, -2 * spacing, 2 * spacing) * [1, 1, 0.5, 0.5]
         if np.linalg.norm(p[:2]) > reach or np.any(np.abs(p[2:]) > 0.5):
             return None
         correlation = float(np.corrcoef(now, sought.values)[0, 1])
-        A = gain**2 * (W[:, : int(free.sum())].T @ X[:, : int(free.sum())])
+        A = gain**2 * (W[:, :4].T @ X[:, :4])
         if np.linalg.norm(step[:2]) < 0.002 and np.abs(step[2:]).max() < 2e-5:
             break
     sigma2 = float(np.sum(weight * left**2) / max(np.sum(weight) - 6, 1))
-    cov = np.zeros((4, 4))
-    cov[np.ix_(free, free)] = np.linalg.pinv(A) * sigma2
-    return Alignment(p[:2], p[2:], cov, correlation)
+    return Alignment(p[:2], p[2:], np.asarray(np.linalg.pinv(A), dtype=float) * sigma2, correlation)
 
 
 def part_values(levels: list[Grey], quads: Array) -> Array:
