@@ -288,8 +288,8 @@ def _check_epipolar(scene: _Scene, pictures: dict[str, Image], run_: Run) -> Non
     if found is None or found[0] <= OFF_PX:
         return
     said = (
-        f"{scene.files[0]}: {found[1]} features matched between the views lie {found[0]:.1f} px off their epipolar lines "
-        "in the median"
+        f"{scene.files[0]}: {found[1]} features matched between the views lie {found[0]:.1f} px off their epipolar "
+        "lines in the median"
     )
     if found[0] > NONSENSE_PX:
         raise InputError(f"{said}; this is not the calibration of this footage, or left and right are exchanged")
@@ -419,9 +419,8 @@ def text(result: RunResult) -> str:
     lines = [f"{'vehicles':<12} {summary['vehicles']}"]
     for each in summary["speeds"]:
         low, high = (end * factor for end in each["speed_ci95"])
-        lines.append(
-            f"  {each['id']:<10} {each['speed'] * factor:.2f} {units} [{low:.2f}, {high:.2f}] over {each['distance']:.1f} m"
-        )
+        speed = f"{each['speed'] * factor:.2f} {units} [{low:.2f}, {high:.2f}]"
+        lines.append(f"  {each['id']:<10} {speed} over {each['distance']:.1f} m")
     lines.append(f"{'pairs':<12} {summary['pairs']}")
     lines.append(f"{'results':<12} {summary['out']}")
     return "\n".join(lines)

@@ -76,7 +76,7 @@ def inside(quad: Array, size: tuple[int, int], margin: float = 1.0) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class Template:
-    """A patch to be found again: grey values (n,) at unit-square points (n, 2), one sample `step` (px) from the next."""
+    """A patch to be found again: grey values (n,) at points (n, 2) of the unit square."""
 
     unit: Array
     values: Array
