@@ -18,11 +18,13 @@ MAY_IMPORT = {
     "files": {"maths", "config", "records", "errors"},
     "tracking": {"vision", "maths", "config", "records", "errors"},
     "fusing": {"tracking", "vision", "maths", "config", "records", "errors"},
+    "facing": {"vision", "maths", "config", "records", "errors"},
     "pipeline": {"tracking", "vision", "maths", "files", "records", "errors"},
     "commands": {
         "pipeline",
         "tracking",
         "fusing",
+        "facing",
         "vision",
         "maths",
         "files",

@@ -51,6 +51,7 @@ QuietOption = Annotated[bool, typer.Option("-q", "--quiet", help="Print nothing 
 CONFIGURED = {  # command -> where its configuration model is
     "calibrate-homography": ("visfuse_cli.commands.calibrate_homography", "CalibrateConfig"),
     "speed": ("visfuse_cli.commands.speed", "SpeedConfig"),
+    "track-stereo-pf": ("visfuse_cli.commands.track_stereo_pf", "StereoConfig"),
     "fuse-cameras": ("visfuse_cli.commands.fuse_cameras", "FuseConfig"),
 }
 BY = ("hour", "day", "weekday", "lane", "direction")
@@ -284,6 +285,48 @@ def fuse_cameras(
         out=out,
         config=_load("fuse-cameras", config, set_),
         options={"estimate_offsets": estimate_offsets},
+        overwrite=overwrite,
+        video=not no_video,
+        report=not no_report,
+        start=start,
+        end=end,
+        seed=seed,
+        progress=not (no_progress or quiet or _quiet),
+        argv=tuple(sys.argv),
+    )
+    _report(_with_page(command.run(request), request.report), as_json, quiet, command.text)
+
+
+@app.command("track-stereo-pf")
+def track_stereo_pf(
+    scene: Annotated[
+        Path, typer.Argument(metavar="SCENE", help="A folder: left.*, right.*, calibration.yaml; init.yaml, path.yaml.")
+    ],
+    out: OutOption,
+    config: ConfigOption = None,
+    set_: SetOption = None,
+    overwrite: OverwriteOption = False,
+    no_video: NoVideoOption = False,
+    no_report: NoReportOption = False,
+    start: StartOption = None,
+    end: EndOption = None,
+    seed: SeedOption = 0,
+    no_progress: NoProgressOption = False,
+    as_json: JsonOption = False,
+    quiet: QuietOption = False,
+) -> None:
+    """Speed of vehicles that face a static stereo pair, by a particle filter along their path.
+
+    Example: visfuse track-stereo-pf scene --out run
+    """
+    from visfuse_cli.commands import track_stereo_pf as command
+    from visfuse_cli.records import RunRequest
+
+    request = RunRequest(
+        command="track-stereo-pf",
+        input=scene,
+        out=out,
+        config=_load("track-stereo-pf", config, set_),
         overwrite=overwrite,
         video=not no_video,
         report=not no_report,

@@ -1,0 +1,155 @@
+"""Vehicles that nobody named: what moves in the left view, matched along its epipolar lines in the right one."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from visfuse_cli.facing.settings import StereoConfig
+from visfuse_cli.maths.planes import in_right, projected
+from visfuse_cli.records import Array, Image, StereoRig
+from visfuse_cli.vision import patches
+from visfuse_cli.vision.background import FOREGROUND, Background
+from visfuse_cli.vision.patches import Grey
+
+NEAREST, STEPS = 1.0, 1200  # m; most depths that are tried
+STEP_PX = 0.5  # of disparity, between them
+OVERLAP = 0.2  # share of a region that a vehicle which is followed already may hold
+LEAST_MOVE = 0.02  # of its size, that a region must have moved or grown
+DENSE = 0.6  # share of the fullest row or column
+MEMORY_S, SHADOW = 60.0, 0.5
+
+
+@dataclass(slots=True)
+class _Candidate:
+    box: Array  # [u0, v0, u1, v1] px
+    first: Array
+    first_t: float
+    seen: int = 1
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """A region that moves: its left quad (4, 2) px, how fast its middle moves (2,) px/s, and its growth (1/s)."""
+
+    quad: Array
+    motion: Array
+    growth: float
+
+    def velocity(self, rig: StereoRig, place: Array) -> Array:
+        """Velocity (3,) m/s of what stands at a place (3,) m."""
+        away = -self.growth * place[2]
+        across = self.motion / np.diag(rig.left.K)[:2] * place[2]
+        return np.array([across[0], across[1], 0.0]) + away * place / place[2]
+
+
+class Finder:
+    """Looks at each left picture; `empty` (H, W, 3) is the scene without vehicles."""
+
+    def __init__(self, rig: StereoRig, empty: Image, config: StereoConfig) -> None:
+        self._rig, self._config = rig, config
+        self._background = Background("mog2", config.detection.threshold, SHADOW, MEMORY_S)
+        self._background.start(empty)
+        self._candidates: list[_Candidate] = []
+
+    def look(self, picture: Image, t: float, known: list[Array]) -> list[Found]:
+        """Regions that have moved for some frames, away from quads that are `known`."""
+        boxes = self._regions(picture)
+        held = [np.concatenate([quad.min(axis=0), quad.max(axis=0)]) for quad in known]
+        boxes = [box for box in boxes if not any(_shared(box, other) > OVERLAP for other in held)]
+        self._background.learn(picture, t, [_corners(box) for box in [*boxes, *held]])
+        kept = []
+        for box in boxes:
+            before = next((c for c in self._candidates if _near(c.box, box)), None)
+            if before is None:
+                kept.append(_Candidate(box, box, t))
+            else:
+                kept.append(_Candidate(box, before.first, before.first_t, before.seen + 1))
+        ready = [c for c in kept if c.seen >= self._config.detection.confirm_frames + 1 and _moved(c)]
+        self._candidates = [c for c in kept if not any(c is other for other in ready)]
+        return [self._found(c, t) for c in ready]
+
+    def _regions(self, picture: Image) -> list[Array]:
+        """Boxes [u0, v0, u1, v1] of what moves and lies whole in the picture."""
+        mask = cv2.compare(self._background.detect(picture), FOREGROUND, cv2.CMP_EQ)
+        mask = cv2.morphologyEx(mask, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
+        reach = max(3, round(picture.shape[0] / 100) | 1)
+        mask = cv2.morphologyEx(mask, cv2.MORPH_CLOSE, np.ones((reach, reach), np.uint8))
+        _, _, blobs, _ = cv2.connectedComponentsWithStats(np.asarray(mask, np.uint8))
+        high, wide = picture.shape[:2]
+        least = self._config.detection.smallest
+        found = []
+        for x, y, w, h, area in blobs[1:]:
+            whole = x > 1 and y > 1 and x + w < wide - 1 and y + h < high - 1
+            if min(w, h) >= least and area > 0.4 * w * h and whole:
+                box = _dense(mask[y : y + h, x : x + w]) + [x, y, x, y]
+                if np.all(box[2:] - box[:2] >= least):
+                    found.append(box)
+        return found
+
+    def _found(self, candidate: _Candidate, t: float) -> Found:
+        dt = t - candidate.first_t
+        old, new = candidate.first, candidate.box
+        moved = ((new[:2] + new[2:]) - (old[:2] + old[2:])) / 2
+        grown = 0.5 * float(np.log(np.prod(new[2:] - new[:2]) / np.prod(old[2:] - old[:2])))
+        return Found(self._quad(new), moved / dt, grown / dt)
+
+    def _quad(self, box: Array) -> Array:
+        """The corners of a region less its rim, where background shows."""
+        share = self._config.detection.margin
+        rim = share * (box[2:] - box[:2])
+        return _corners(box + np.concatenate([rim, -rim]))
+
+
+def match(rig: StereoRig, views: dict[str, list[Grey]], left: Array, good: float) -> Array | None:
+    """The right quad (4, 2) px that shows what a left quad (4, 2) shows, over all depths; None where none does."""
+    focal = float(np.sqrt(rig.left.K[0, 0] * rig.left.K[1, 1]))
+    most = focal * rig.baseline / NEAREST
+    disparity = np.linspace(0.5, most, int(min(STEPS, most / STEP_PX)))
+    rays = np.column_stack([left, np.ones(4)]) @ np.linalg.inv(rig.left.K).T
+    depth = focal * rig.baseline / disparity
+    quads = projected(rig.right.K, in_right(rig, rays[None] * depth[:, None, None]))
+    size = views["right"][0].shape[1], views["right"][0].shape[0]
+    usable = np.isfinite(quads).all(axis=(1, 2)) & np.all((quads > 0) & (quads < np.array(size) - 1), axis=(1, 2))
+    if not usable.any():
+        return None
+    quads = quads[usable]
+    here = patches.part_values(views["left"], left[None])[0]
+    score = patches.correlations(patches.part_values(views["right"], quads), here)
+    best = int(np.argmax(score))
+    return np.asarray(quads[best]) if score[best] > good else None
+
+
+def _dense(mask: Image) -> Array:
+    """The box [u0, v0, u1, v1] of those rows and columns of a region that are well filled: without shadows' ends."""
+    ends = []
+    for axis in (0, 1):
+        filled = np.count_nonzero(mask, axis=axis)
+        good = np.flatnonzero(filled >= DENSE * filled.max())
+        ends.append((good[0] - 0.5, good[-1] + 0.5))
+    return np.array([ends[0][0], ends[1][0], ends[0][1], ends[1][1]])
+
+
+def _corners(box: Array) -> Array:
+    u0, v0, u1, v1 = box
+    return np.array([[u0, v0], [u1, v0], [u1, v1], [u0, v1]])
+
+
+def _shared(box: Array, other: Array) -> float:
+    inner = np.clip(np.minimum(box[2:], other[2:]) - np.maximum(box[:2], other[:2]), 0, None)
+    return float(np.prod(inner) / min(np.prod(box[2:] - box[:2]), np.prod(other[2:] - other[:2])))
+
+
+def _near(one: Array, other: Array) -> bool:
+    """Whether two boxes may be one vehicle in two frames."""
+    size = np.minimum(one[2:] - one[:2], other[2:] - other[:2])
+    apart = np.abs((one[:2] + one[2:]) / 2 - (other[:2] + other[2:]) / 2)
+    ratio = (one[2:] - one[:2]) / (other[2:] - other[:2])
+    return bool(np.all(apart < 1.5 * size) and np.all((ratio > 0.6) & (ratio < 1.7)))
+
+
+def _moved(candidate: _Candidate) -> bool:
+    size = candidate.first[2:] - candidate.first[:2]
+    return bool(np.abs(candidate.box - candidate.first).max() > max(2.0, LEAST_MOVE * float(size.max())))

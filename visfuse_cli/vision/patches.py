@@ -1,0 +1,193 @@
+"""A flat patch in pictures: sampled on a grid, aligned to sub-pixel, compared part by part for many poses at once."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from visfuse_cli.records import Array, Image
+
+Grey = NDArray[np.float32]
+PARTS = (5, 2)  # across and down
+CELLS = 4  # of each part, each way
+LEVELS = 5
+ROUNDS = 20
+FEWEST, MOST = 10, 72  # samples along a side of a patch that is aligned
+HUBER = 2.5
+LONGEST = 30000  # rows of a picture that remap makes
+RIM_PX = 0.5  # px inside of a quad at which its patch begins: beyond its edge lies something else
+
+
+def pyramid(image: Image) -> list[Grey]:
+    """The grey picture and its halves; pixel u of level k lies at u 2^k of the first."""
+    levels: list[Grey] = [np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), np.float32)]
+    for _ in range(LEVELS - 1):
+        if min(levels[-1].shape) < 40:
+            break
+        levels.append(np.asarray(cv2.pyrDown(levels[-1]), np.float32))
+    return levels
+
+
+def sampled(levels: list[Grey], points: Array, spacing: float) -> Grey:
+    """Grey values (...) at pixels (..., 2), from the level whose pixels are as wide as `spacing` (px); 0 outside."""
+    level = int(np.clip(np.floor(np.log2(max(spacing, 1.0)) + 0.3), 0, len(levels) - 1))
+    at = (points / 2**level).astype(np.float32)
+    flat = np.ascontiguousarray(at.reshape(-1, 2))
+    # One row of the picture that is made for each pose.
+    columns = points.shape[-2] if points.ndim > 2 else len(flat)
+    maps = np.nan_to_num(flat, nan=-1e6).reshape(-1, columns, 2)
+    pieces = np.array_split(maps, -(-len(maps) // LONGEST))
+    out = [cv2.remap(levels[level], piece, None, cv2.INTER_LINEAR) for piece in pieces]
+    return np.concatenate(out).reshape(points.shape[:-1])
+
+
+def grid(count: tuple[int, int]) -> Array:
+    """Middles (n, 2) of cells over the unit square, row by row."""
+    u, v = np.meshgrid((np.arange(count[0]) + 0.5) / count[0], (np.arange(count[1]) + 0.5) / count[1])
+    return np.column_stack([u.ravel(), v.ravel()])
+
+
+def warped(quads: Array, unit: Array) -> Array:
+    """Pixels (..., n, 2) of unit-square points (n, 2) in quads (..., 4, 2), clockwise from the top left: projective."""
+    a, b, c, d = np.moveaxis(quads, -2, 0)
+    p, q, r = b - c, d - c, a - b + c - d
+    area = p[..., 0] * q[..., 1] - p[..., 1] * q[..., 0]
+    g = (r[..., 0] * q[..., 1] - r[..., 1] * q[..., 0]) / area
+    h = (p[..., 0] * r[..., 1] - p[..., 1] * r[..., 0]) / area
+    along, down = b - a + g[..., None] * b, d - a + h[..., None] * d
+    x, y = unit[:, 0, None], unit[:, 1, None]
+    top = along[..., None, :] * x + down[..., None, :] * y + a[..., None, :]
+    return np.asarray(top / (g[..., None, None] * x + h[..., None, None] * y + 1))
+
+
+def side(quad: Array) -> tuple[float, float]:
+    """Mean width and height (px) of a quad (4, 2)."""
+    edge = np.linalg.norm(np.roll(quad, -1, axis=0) - quad, axis=1)
+    return float(edge[0] + edge[2]) / 2, float(edge[1] + edge[3]) / 2
+
+
+def inside(quad: Array, size: tuple[int, int], margin: float = 1.0) -> bool:
+    """Whether a quad (4, 2) lies in a picture of that size."""
+    return bool(np.isfinite(quad).all() and np.all(quad > margin) and np.all(quad < np.array(size) - 1 - margin))
+
+
+@dataclass(frozen=True, slots=True)
+class Template:
+    """A patch to be found again: grey values (n,) at points (n, 2) of the unit square."""
+
+    unit: Array
+    values: Array
+
+
+def template(levels: list[Grey], quad: Array) -> Template:
+    """The patch in a quad (4, 2), sampled about as finely as the picture shows it."""
+    wide, high = side(quad)
+    count = (int(np.clip(round(wide), FEWEST, MOST)), int(np.clip(round(high), FEWEST, MOST)))
+    rim = RIM_PX / np.array([wide, high])
+    unit = rim + (1 - 2 * rim) * grid(count)
+    return Template(unit, sampled(levels, warped(quad, unit), _spacing(quad, count)).astype(float))
+
+
+def _spacing(quad: Array, count: tuple[int, int]) -> float:
+    wide, high = side(quad)
+    return float(np.sqrt(wide / count[0] * high / count[1]))
+
+
+def _count(unit: Array) -> tuple[int, int]:
+    across = int(np.sum(unit[:, 1] == unit[0, 1]))
+    return across, len(unit) // across
+
+
+@dataclass(frozen=True, slots=True)
+class Alignment:
+    """Where a patch was found: shift (2,) px and log stretch (2,) of the quad about its middle, their covariance (4, 4)
+    and the correlation with the template.
+    """
+
+    shift: Array
+    stretch: Array
+    cov: Array
+    correlation: float
+
+    def quad(self, quad: Array) -> Array:
+        """The quad (4, 2) as it was found."""
+        middle = quad.mean(axis=0)
+        return np.asarray(middle + self.shift + np.exp(self.stretch) * (quad - middle))
+
+
+def align(levels: list[Grey], quad: Array, sought: Template, stretch_sigma: float = np.inf) -> Alignment | None:
+    """Find a template near a quad (4, 2) by Gauss-Newton on grey values, gain and offset free; None where it is lost.
+
+    The log stretch is believed to be zero but for `stretch_sigma`.
+    """
+    points = warped(quad, sought.unit)
+    middle = quad.mean(axis=0)
+    spacing = _spacing(quad, _count(sought.unit))
+    p = np.zeros(4)
+    reach = max(3.0, 0.25 * min(side(quad)))
+    A, weight, left = np.zeros((4, 4)), np.ones(len(points)), np.zeros(len(points))
+    correlation, h = 0.0, max(0.5, spacing / 2)
+    gain, noise2 = 1.0, 1.0
+    for _ in range(ROUNDS):
+        away = points - middle
+        at = middle + p[:2] + np.exp(p[2:]) * away
+        around = np.stack([at, at + [h, 0], at - [h, 0], at + [0, h], at - [0, h]])
+        values = sampled(levels, around, spacing).astype(float)
+        now = values[0]
+        spread = float(now.std())
+        if spread < 1e-3 or float(sought.values.std()) < 1e-3:
+            return None
+        gx, gy = (values[1] - values[2]) / (2 * h), (values[3] - values[4]) / (2 * h)
+        scaled = np.exp(p[2:]) * away
+        J = np.column_stack([gx, gy, gx * scaled[:, 0], gy * scaled[:, 1]])
+        X = np.column_stack([J, now, np.ones(len(now))])
+        # template = a I(x(p)) + b: linear in gain and offset, so they are solved with the step
+        W = weight[:, None] * X
+        normal, known = W.T @ X + 1e-9 * np.eye(6), W.T @ sought.values
+        pull = noise2 / (gain**2 * stretch_sigma**2)  # of the prior, on gain times stretch
+        normal[[2, 3], [2, 3]] += pull
+        known[2:4] -= pull * gain * p[2:]
+        solution = np.linalg.lstsq(normal, known, rcond=None)[0]
+        gain = float(solution[-2])
+        if gain <= 0.05:
+            return None
+        left = sought.values - X @ solution
+        scale = 1.4826 * float(np.median(np.abs(left))) + 1e-6
+        noise2 = scale**2
+        weight = np.minimum(1.0, HUBER * scale / np.maximum(np.abs(left), 1e-9))
+        step = solution[:4] / gain
+        p = p + np.clip(step, -2 * spacing, 2 * spacing) * [1, 1, 0.5, 0.5]
+        if np.linalg.norm(p[:2]) > reach or np.any(np.abs(p[2:]) > 0.5):
+            return None
+        correlation = float(np.corrcoef(now, sought.values)[0, 1])
+        A = gain**2 * (W[:, :4].T @ X[:, :4])
+        if np.linalg.norm(step[:2]) < 0.002 and np.abs(step[2:]).max() < 2e-5:
+            break
+    sigma2 = float(np.sum(weight * left**2) / max(np.sum(weight) - 6, 1))
+    return Alignment(p[:2], p[2:], np.asarray(np.linalg.pinv(A), dtype=float) * sigma2, correlation)
+
+
+def part_values(levels: list[Grey], quads: Array) -> Array:
+    """Cell values (P, cells) of the parts of quads (P, 4, 2): 10 parts of 4 x 4 cells, normalised in mean and contrast.
+
+    In orthonormal form the distance of a part's 16 Haar-like values is that of its 16 cells. Zhu 2012, eq. 13.
+    """
+    unit = grid((PARTS[0] * CELLS, PARTS[1] * CELLS))
+    values = sampled(levels, warped(quads, unit), _spacing(quads[0], (PARTS[0] * CELLS, PARTS[1] * CELLS))).astype(
+        float
+    )
+    values -= values.mean(axis=-1, keepdims=True)
+    return np.asarray(values / np.maximum(values.std(axis=-1, keepdims=True), 1e-3))
+
+
+def part_distance(values: Array, reference: Array) -> Array:
+    """Mean distance (P,) of the parts from a reference (cells,). Zhu 2012, eq. 13."""
+    return np.asarray(np.mean((values - reference) ** 2, axis=-1))
+
+
+def correlations(left: Array, right: Array) -> Array:
+    """Normalised cross-correlation (P,) of what both views show. Zhu 2012, eqs. 17-18."""
+    return np.asarray(np.mean(left * right, axis=-1))
