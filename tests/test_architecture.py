@@ -18,6 +18,7 @@ MAY_IMPORT = {
     "files": {"maths", "config", "records", "errors"},
     "tracking": {"vision", "maths", "config", "records", "errors"},
     "fusing": {"tracking", "vision", "maths", "config", "records", "errors"},
+    "moving": {"vision", "maths", "config", "records", "errors"},
     "facing": {"vision", "maths", "config", "records", "errors"},
     "pipeline": {"tracking", "vision", "maths", "files", "records", "errors"},
     "commands": {
@@ -25,6 +26,7 @@ MAY_IMPORT = {
         "tracking",
         "fusing",
         "facing",
+        "moving",
         "vision",
         "maths",
         "files",

@@ -51,6 +51,7 @@ QuietOption = Annotated[bool, typer.Option("-q", "--quiet", help="Print nothing 
 CONFIGURED = {  # command -> where its configuration model is
     "calibrate-homography": ("visfuse_cli.commands.calibrate_homography", "CalibrateConfig"),
     "speed": ("visfuse_cli.commands.speed", "SpeedConfig"),
+    "track-imm": ("visfuse_cli.commands.track_imm", "ImmConfig"),
     "track-stereo-pf": ("visfuse_cli.commands.track_stereo_pf", "StereoConfig"),
     "fuse-cameras": ("visfuse_cli.commands.fuse_cameras", "FuseConfig"),
 }
@@ -327,6 +328,49 @@ def track_stereo_pf(
         input=scene,
         out=out,
         config=_load("track-stereo-pf", config, set_),
+        overwrite=overwrite,
+        video=not no_video,
+        report=not no_report,
+        start=start,
+        end=end,
+        seed=seed,
+        progress=not (no_progress or quiet or _quiet),
+        argv=tuple(sys.argv),
+    )
+    _report(_with_page(command.run(request), request.report), as_json, quiet, command.text)
+
+
+@app.command("track-imm")
+def track_imm(
+    scene: Annotated[
+        Path,
+        typer.Argument(metavar="SCENE", help="A folder: left.*, right.*, calibration.yaml, sensors.csv; init.yaml."),
+    ],
+    out: OutOption,
+    config: ConfigOption = None,
+    set_: SetOption = None,
+    overwrite: OverwriteOption = False,
+    no_video: NoVideoOption = False,
+    no_report: NoReportOption = False,
+    start: StartOption = None,
+    end: EndOption = None,
+    seed: SeedOption = 0,
+    no_progress: NoProgressOption = False,
+    as_json: JsonOption = False,
+    quiet: QuietOption = False,
+) -> None:
+    """What moves before a moving stereo camera, in 3D, by interacting motion models.
+
+    Example: visfuse track-imm scene --out run
+    """
+    from visfuse_cli.commands import track_imm as command
+    from visfuse_cli.records import RunRequest
+
+    request = RunRequest(
+        command="track-imm",
+        input=scene,
+        out=out,
+        config=_load("track-imm", config, set_),
         overwrite=overwrite,
         video=not no_video,
         report=not no_report,

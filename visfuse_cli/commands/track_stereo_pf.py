@@ -17,7 +17,7 @@ from visfuse_cli.errors import InputError
 from visfuse_cli.facing import target as front
 from visfuse_cli.facing.annotate import UNITS, Drawn, together, together_size
 from visfuse_cli.facing.conclude import conclude
-from visfuse_cli.facing.find import Finder, Found, match
+from visfuse_cli.facing.find import Finder, Found
 from visfuse_cli.facing.output import track_record
 from visfuse_cli.facing.settings import StereoConfig
 from visfuse_cli.facing.target import Target
@@ -37,6 +37,7 @@ from visfuse_cli.records import Array, FrameSet, Image, Lens, RunRequest, RunRes
 from visfuse_cli.vision import patches
 from visfuse_cli.vision.background import empty_picture
 from visfuse_cli.vision.epipolar_check import epipolar_residual
+from visfuse_cli.vision.epipolar_match import match
 from visfuse_cli.vision.lens import undistort_points
 from visfuse_cli.vision.patches import Grey
 

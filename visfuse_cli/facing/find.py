@@ -1,4 +1,4 @@
-"""Vehicles that nobody named: what moves in the left view, matched along its epipolar lines in the right one."""
+"""Vehicles that nobody named: what moves in the left view."""
 
 from __future__ import annotations
 
@@ -8,14 +8,9 @@ import cv2
 import numpy as np
 
 from visfuse_cli.facing.settings import StereoConfig
-from visfuse_cli.maths.planes import in_right, projected
 from visfuse_cli.records import Array, Image, StereoRig
-from visfuse_cli.vision import patches
 from visfuse_cli.vision.background import FOREGROUND, Background
-from visfuse_cli.vision.patches import Grey
 
-NEAREST, STEPS = 1.0, 1200  # m; most depths that are tried
-STEP_PX = 0.5  # of disparity, between them
 OVERLAP = 0.2  # share of a region that a vehicle which is followed already may hold
 LEAST_MOVE = 0.02  # of its size, that a region must have moved or grown
 DENSE = 0.6  # share of the fullest row or column
@@ -101,25 +96,6 @@ class Finder:
         share = self._config.detection.margin
         rim = share * (box[2:] - box[:2])
         return _corners(box + np.concatenate([rim, -rim]))
-
-
-def match(rig: StereoRig, views: dict[str, list[Grey]], left: Array, good: float) -> Array | None:
-    """The right quad (4, 2) px that shows what a left quad (4, 2) shows, over all depths; None where none does."""
-    focal = float(np.sqrt(rig.left.K[0, 0] * rig.left.K[1, 1]))
-    most = focal * rig.baseline / NEAREST
-    disparity = np.linspace(0.5, most, int(min(STEPS, most / STEP_PX)))
-    rays = np.column_stack([left, np.ones(4)]) @ np.linalg.inv(rig.left.K).T
-    depth = focal * rig.baseline / disparity
-    quads = projected(rig.right.K, in_right(rig, rays[None] * depth[:, None, None]))
-    size = views["right"][0].shape[1], views["right"][0].shape[0]
-    usable = np.isfinite(quads).all(axis=(1, 2)) & np.all((quads > 0) & (quads < np.array(size) - 1), axis=(1, 2))
-    if not usable.any():
-        return None
-    quads = quads[usable]
-    here = patches.part_values(views["left"], left[None])[0]
-    score = patches.correlations(patches.part_values(views["right"], quads), here)
-    best = int(np.argmax(score))
-    return np.asarray(quads[best]) if score[best] > good else None
 
 
 def _dense(mask: Image) -> Array:

@@ -28,6 +28,73 @@ def constant_velocity_noise(dt: ArrayLike, q: ArrayLike, dims: int = 2) -> Array
     return _each_axis([[q * dt**3 / 3, q * dt**2 / 2], [q * dt**2 / 2, q * dt]], dims)
 
 
+def constant_acceleration(dt: ArrayLike, dims: int = 2) -> Array:
+    """F (..., 3 dims, 3 dims) over dt (...) s for the state [position, velocity, acceleration]. Jia 2008, eq. 20.
+
+    The position gains dt^2/2 times the acceleration, which the printed matrix leaves out.
+    """
+    dt = np.asarray(dt, dtype=float)
+    one, zero = np.ones_like(dt), np.zeros_like(dt)
+    return _each_axis([[one, dt, dt**2 / 2], [zero, one, dt], [zero, zero, one]], dims)
+
+
+def constant_acceleration_noise(dt: ArrayLike, q: ArrayLike, dims: int = 2) -> Array:
+    """Q (..., 3 dims, 3 dims) of white jerk with density q (m^2 s^-5) over dt (...) s."""
+    dt, q = np.broadcast_arrays(np.asarray(dt, dtype=float), np.asarray(q, dtype=float))
+    pp, pv, pa, va = dt**5 / 20, dt**4 / 8, dt**3 / 6, dt**2 / 2
+    return _each_axis([[q * pp, q * pv, q * pa], [q * pv, q * dt**3 / 3, q * va], [q * pa, q * va, q * dt]], dims)
+
+
+def drifting_point(dt: ArrayLike, dims: int = 2) -> Array:
+    """F (..., 2 dims, 2 dims) over dt (...) s: the position stays, the velocity is forgotten. Jia 2008, eq. 18.
+
+    The printed identity keeps a velocity that no longer moves the point: here it is zero, with `drifting_point_noise`.
+    """
+    zero = np.zeros_like(np.asarray(dt, dtype=float))
+    return _each_axis([[zero + 1, zero], [zero, zero]], dims)
+
+
+def drifting_point_noise(dt: ArrayLike, q: ArrayLike, velocity_variance: ArrayLike, dims: int = 2) -> Array:
+    """Q (..., 2 dims, 2 dims) of a random walk with density q (m^2/s), its velocity unknown to (m/s)^2."""
+    dt, q, vv = np.broadcast_arrays(*(np.asarray(value, dtype=float) for value in (dt, q, velocity_variance)))
+    return _each_axis([[q * dt, 0 * q], [0 * q, vv]], dims)
+
+
+def periodic(dt: ArrayLike, omega: ArrayLike, dims: int = 2, euler: bool = False) -> Array:
+    """F (..., 3 dims, 3 dims) over dt (...) s for [position, velocity, centre], omega (...) rad/s. Jia 2008, eq. 21.
+
+    The exact rotation about the centre; `euler` is the paper's forward step, whose swing grows by
+    sqrt(1 + (omega dt)^2) each time.
+    """
+    dt, w = np.broadcast_arrays(np.asarray(dt, dtype=float), np.asarray(omega, dtype=float))
+    zero = np.zeros_like(dt)
+    if euler:
+        c, s, r = zero + 1, dt, -(w**2) * dt
+    else:
+        c, s, r = np.cos(w * dt), dt * np.sinc(w * dt / np.pi), -w * np.sin(w * dt)
+    return _each_axis([[c, s, 1 - c], [r, c, -r], [zero, zero, zero + 1]], dims)
+
+
+def periodic_noise(dt: ArrayLike, omega: ArrayLike, q: ArrayLike, q_centre: ArrayLike, dims: int = 2) -> Array:
+    """Q (..., 3 dims, 3 dims) of white acceleration (q, m^2 s^-3) and a wandering centre (q_centre, m^2/s)."""
+    values = (dt, omega, q, q_centre)
+    dt, w, q, qc = np.broadcast_arrays(*(np.asarray(value, dtype=float) for value in values))
+    x = w * dt
+    once, twice = np.sinc(x / np.pi), np.sinc(2 * x / np.pi)  # means of cos(w u) and cos(2 w u) over the step
+    pp = q * dt**3 / 3 * _cubic(2 * x) + qc * dt * (1.5 - 2 * once + twice / 2)
+    pv = q * dt**2 / 2 * once**2 + qc * (1 - np.cos(x)) ** 2 / 2
+    vv = q * dt * (1 + twice) / 2 + qc * w**2 * dt * (1 - twice) / 2
+    pc, vc, cc = qc * dt * (1 - once), qc * (1 - np.cos(x)), qc * dt
+    return _each_axis([[pp, pv, pc], [pv, vv, vc], [pc, vc, cc]], dims)
+
+
+def _cubic(x: Array) -> Array:
+    """6 (x - sin x) / x^3, by series where it would cancel."""
+    small = np.abs(x) < 0.1
+    safe = np.where(small, 1.0, x)
+    return np.where(small, 1 - x**2 / 20 + x**4 / 840, 6 * (safe - np.sin(safe)) / safe**3)
+
+
 def _each_axis(block: list[list[Array]], dims: int) -> Array:
     """A block of order p, its entries (...), repeated for every axis: (..., p dims, p dims)."""
     matrix = np.stack([np.stack(row, axis=-1) for row in block], axis=-2)
@@ -46,8 +113,8 @@ def bicycle(x: Array, dt: ArrayLike, wheelbase: ArrayLike) -> tuple[Array, Array
     dt, wheelbase = np.asarray(dt, dtype=float), np.asarray(wheelbase, dtype=float)
     tau = np.tan(phi)
     way, turn = v * dt, v * dt * tau / wheelbase
-    chord, chord_slope = _sinc(turn / 2)
-    along, across = _axes(theta + turn / 2)
+    chord, chord_slope = sinc(turn / 2)
+    along, across = axes(theta + turn / 2)
     # The rear axle's chord plus the turn of the half wheelbase ahead of it; both point along or across mid-heading.
     course = along + (tau / 2)[..., None] * across
     course_turned = across - (tau / 2)[..., None] * along
@@ -90,7 +157,7 @@ def bicycle_velocity(x: Array) -> tuple[Array, Array]:
     Its length is |v| sqrt(1 + 3 cos^2 phi) / (2 cos phi), its direction theta + atan(tan(phi) / 2).
     """
     v, theta, phi = x[..., 2, None], x[..., 3], np.clip(x[..., 4, None], -STEERING_LIMIT, STEERING_LIMIT)
-    along, across = _axes(theta)
+    along, across = axes(theta)
     half = np.tan(phi) / 2
     J = np.zeros((*x.shape[:-1], 2, 5))
     J[..., 2] = along + half * across
@@ -99,12 +166,13 @@ def bicycle_velocity(x: Array) -> tuple[Array, Array]:
     return v * J[..., 2], J
 
 
-def _axes(heading: Array) -> tuple[Array, Array]:
+def axes(heading: Array) -> tuple[Array, Array]:
+    """Unit vectors (..., 2) along a heading (...) rad and to its left."""
     c, s = np.cos(heading), np.sin(heading)
     return np.stack([c, s], axis=-1), np.stack([-s, c], axis=-1)
 
 
-def _sinc(x: Array) -> tuple[Array, Array]:
+def sinc(x: Array) -> tuple[Array, Array]:
     """sin(x)/x and its derivative, by series where the quotients would cancel."""
     small = np.abs(x) < 1e-2
     safe = np.where(small, 1.0, x)

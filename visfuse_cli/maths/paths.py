@@ -136,10 +136,10 @@ def curved(rig: StereoRig, left: Array, right: Array) -> Way:
     assert best is not None
     if np.sqrt(np.mean(off(best.x)[:SAMPLES] ** 2)) > 3.0 or np.any(basis @ best.x < 1e-4):
         raise ValueError("the two images of the path do not fit one curve before both cameras")
-    found = points(best.x)
-    way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(found, axis=0), axis=1))])
+    curve_points = points(np.asarray(best.x))
+    way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(curve_points, axis=0), axis=1))])
     picked = np.unique(np.searchsorted(way, np.linspace(0, way[-1], 13)).clip(0, SAMPLES - 1))
-    return Way(found[picked])
+    return Way(curve_points[picked])
 
 
 def _resampled(line: Array) -> Array:

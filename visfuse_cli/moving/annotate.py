@@ -1,0 +1,78 @@
+"""Both views side by side with the targets' boxes, and a small map of the camera's way and theirs."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import cv2
+import numpy as np
+
+from visfuse_cli.maths.planes import in_right, projected
+from visfuse_cli.moving.target import Head
+from visfuse_cli.records import Array, Image, StereoRig
+from visfuse_cli.vision import drawing
+
+UNITS = {"km/h": 3.6, "mph": 2.2369362920544, "m/s": 1.0}
+SHARE = 0.3  # of the picture's height: side of the map
+WHITE = (255, 255, 255)
+
+
+class Drawn:
+    """One settled track of tracks.json, ready to be drawn."""
+
+    def __init__(self, record: dict[str, Any], size: Array, units: str) -> None:
+        self.id = int(record["id"])
+        self._states = {int(state["frame"]): state for state in record["states"]}
+        self.frames = np.array([state["frame"] for state in record["states"]])
+        self.places = np.array([state["position"] for state in record["states"]])
+        self._size, self._units = size, units
+        self.colour = drawing.colour_of(self.id)
+
+    def draw(self, pictures: dict[str, Image], frame: int, rig: StereoRig, head: Head) -> None:
+        """Draw one frame: the box as it was measured, and in white the one that the 3D estimate projects to."""
+        state = self._states.get(frame)
+        if state is None:
+            return
+        place = head.inside(np.array(state["position"]))
+        half = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]) / 2 * [*self._size, 0]
+        for view, image in pictures.items():
+            if place[2] > 0.2:
+                corners = place + half
+                shown = corners if view == "left" else in_right(rig, corners)
+                lens = rig.left if view == "left" else rig.right
+                drawing.polyline(image, projected(lens.K, shown), WHITE, closed=True)
+            box = state["box"].get(view)
+            if box is not None and state["measured"]:
+                x, y, w, h = box
+                drawing.polyline(image, np.array([[x, y], [x + w, y], [x + w, y + h], [x, y + h]]), self.colour, True)
+                text = f"{self.id}  {state['speed'] * UNITS[self._units]:.1f} {self._units}"
+                drawing.label(image, text, np.array([x, y - 4.0]), self.colour)
+
+
+def inset(picture: Image, ways: list[Array], tracks: list[Drawn], frame: int, now: int) -> None:
+    """Draw the map into the lower right corner: the camera's way (n, 3) so far and the targets', seen from above."""
+    side = int(SHARE * picture.shape[0])
+    ego = ways[0]
+    every = np.concatenate([ego, *(track.places for track in tracks)])[:, [0, 2]]
+    low, high = every.min(axis=0) - 1, every.max(axis=0) + 1
+    scale = side / float((high - low).max())
+    plate = picture[-side:, -side:]
+    np.copyto(plate, (plate * 0.35).astype(np.uint8))
+
+    def at(places: Array) -> Array:
+        return (places[:, [0, 2]] - (low + high) / 2) * scale * [1, -1] + side / 2
+
+    drawing.polyline(plate, at(ego[: now + 1]), WHITE)
+    spot = at(ego[now : now + 1])[0]
+    cv2.circle(plate, (round(float(spot[0])), round(float(spot[1]))), 3, WHITE, -1, cv2.LINE_AA)
+    for track in tracks:
+        upto = int(np.searchsorted(track.frames, frame, side="right"))
+        if upto:
+            drawing.polyline(plate, at(track.places[:upto]), track.colour)
+
+
+def together(left: Image, right: Image) -> Image:
+    """Both views side by side, of even size."""
+    high = left.shape[0] // 2 * 2
+    wide = left.shape[1] // 2 * 2
+    return np.asarray(np.hstack([left[:high, :wide], right[:high, :wide]]), np.uint8)

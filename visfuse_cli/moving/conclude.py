@@ -1,0 +1,137 @@
+"""What a finished track was: its states given the whole recording, with what is not known of the camera's own way."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from visfuse_cli.moving.models import P, V
+from visfuse_cli.moving.target import Target
+from visfuse_cli.records import Array, Gaussian
+
+Z95 = 1.959963984540054
+EGO_SHARE = 0.02  # of the camera's way: error of its pose that a static thing may seem to move by
+SLOWEST = 0.12  # m/s: what is slower on the whole is not said to move
+
+
+@dataclass(frozen=True, slots=True)
+class Settled:
+    """A finished track over T instants, in the world: belief of position and velocity (T, 6), and what was seen."""
+
+    id: int
+    frame: list[int]
+    t: Array
+    belief: Gaussian
+    log_mu: Array  # (T, r)
+    names: tuple[str, ...]
+    boxes: list[dict[str, Array]]
+    measured: Array
+    ahead: list[Gaussian | None]
+    nis: float
+    size: Array
+    ended_by: str
+
+
+def conclude(target: Target, pose_cov: Array) -> Settled | None:
+    """Settle a track; None where it was measured too rarely, or was found unaided and stands still.
+
+    pose_cov (T, 4, 4) is the covariance of the camera's position and yaw at the track's instants.
+    """
+    life = target.config.life
+    measured = np.array([seen.measured for seen in target.history])
+    if np.count_nonzero(measured) < life.min_frames:
+        return None
+    last = int(np.flatnonzero(measured)[-1]) + 1
+    history, measured = target.history[:last], measured[:last]
+    if target.config.smooth:
+        common, log_mu = target.models.smoothed([seen.step for seen in history])
+    else:
+        common = [target.models.combined(seen.step.filtered) for seen in history]
+        log_mu = [seen.step.filtered.log_mu for seen in history]
+    mean = np.stack([belief.mean for belief in common])[:, :6]
+    cov = np.stack([belief.cov for belief in common])[:, :6, :6]
+    nis = np.array([seen.nis for seen in history])[measured]
+    settled = Settled(
+        id=target.id,
+        frame=[seen.frame for seen in history],
+        t=np.array([seen.t for seen in history]),
+        belief=Gaussian(mean, cov + _of_pose(mean, pose_cov[:last], history)),
+        log_mu=np.stack(log_mu),
+        names=target.models.names,
+        boxes=[seen.boxes for seen in history],
+        measured=measured,
+        ahead=[seen.ahead for seen in history],
+        nis=float(np.mean(nis[1:])) if len(nis) > 1 else 0.0,
+        size=target.size,
+        ended_by=target.ended_by,
+    )
+    return settled if target.given or _moved(target, settled) else None
+
+
+def _of_pose(mean: Array, pose_cov: Array, history: list[Any]) -> Array:
+    """What the camera's own doubt adds (T, 6, 6): its place, and its turning times the distance."""
+    added = np.zeros((len(mean), 6, 6))
+    reach = mean[:, :3] - np.stack([seen.head.T for seen in history])
+    turn = np.stack([-reach[:, 2], 0 * reach[:, 0], reach[:, 0]], axis=1)  # d position / d theta
+    J = np.concatenate([np.tile(np.eye(3), (len(mean), 1, 1)), turn[:, :, None]], axis=2)
+    added[:, :3, :3] = J @ pose_cov @ np.swapaxes(J, 1, 2)
+    return added
+
+
+def _moved(target: Target, settled: Settled) -> bool:
+    """Whether a target found unaided went anywhere in the world, beyond what the camera's pose may be off by."""
+    place = settled.belief.mean[:, :3]
+    net = float(np.linalg.norm(place[-1] - place[0]))
+    doubt = float(np.sqrt(np.trace(settled.belief.cov[0, :3, :3]) + np.trace(settled.belief.cov[-1, :3, :3])))
+    duration = float(settled.t[-1] - settled.t[0])
+    least = target.config.life.min_moved + EGO_SHARE * target.away + 2 * doubt
+    return net > least and net / max(duration, 1e-6) > SLOWEST
+
+
+def track_record(path: Settled, latency: float) -> dict[str, Any]:
+    """One track of tracks.json."""
+    mean, cov = path.belief.mean, path.belief.cov
+    speed = np.linalg.norm(mean[:, V], axis=1)
+    unit = mean[:, V] / np.maximum(speed, 1e-6)[:, None]
+    sigma = np.sqrt(np.clip(np.einsum("ti,tij,tj->t", unit, cov[:, V, V], unit), 0, None))
+    duration = float(path.t[-1] - path.t[0])
+    distance = float(np.sum(np.linalg.norm(np.diff(mean[:, P], axis=0), axis=1))) if len(path.t) > 1 else 0.0
+    mean_speed = distance / duration if duration > 0 else 0.0
+    doubt = float(np.sqrt(np.trace(cov[0, P, P]) / 3 + np.trace(cov[-1, P, P]) / 3)) / duration if duration > 0 else 0.0
+    states = []
+    for k in range(len(path.t)):
+        state: dict[str, Any] = {
+            "frame": path.frame[k],
+            "t": float(path.t[k]),
+            "position": mean[k, P].tolist(),
+            "velocity": mean[k, V].tolist(),
+            "covariance": ((cov[k] + cov[k].T) / 2).tolist(),
+            "speed": float(speed[k]),
+            "speed_sigma": float(sigma[k]),
+            "box": {view: box.tolist() for view, box in path.boxes[k].items()},
+            "measured": bool(path.measured[k]),
+        }
+        if len(path.names) > 1:
+            state["models"] = dict(zip(path.names, np.exp(path.log_mu[k]).tolist(), strict=True))
+        later = path.ahead[k]
+        if later is not None:
+            state["ahead"] = {"t": float(path.t[k] + latency), "position": later.mean[P].tolist()}
+        states.append(state)
+    return {
+        "id": path.id,
+        "summary": {
+            "t_start": float(path.t[0]),
+            "t_end": float(path.t[-1]),
+            "n_frames": int(np.count_nonzero(path.measured)),
+            "distance": distance,
+            "speed": mean_speed,
+            "speed_ci95": [max(0.0, mean_speed - Z95 * doubt), mean_speed + Z95 * doubt],
+            "nis_mean": path.nis,
+            "nis_dof": 5,
+            "size": path.size.tolist(),
+            "ended": path.ended_by,
+        },
+        "states": states,
+    }

@@ -1,0 +1,148 @@
+"""What moves by itself: flow that the camera's motion leaves over, gathered into regions of one motion, place, colour."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from visfuse_cli.moving.settings import ImmConfig
+from visfuse_cli.moving.target import Head
+from visfuse_cli.records import Array, Image, StereoRig
+from visfuse_cli.vision import clusters
+from visfuse_cli.vision.flow import own_motion
+
+SAMPLES = 3000  # pixels that are clustered, at most
+FILLED = 0.3  # share of a region's box that moves by itself
+FARTHEST_M = 40.0
+SLOWEST = 0.15  # m/s that a region must do in the world
+
+
+@dataclass(slots=True)
+class _Candidate:
+    box: Array  # [u0, v0, u1, v1] px
+    seen: int
+    motion: Array
+
+
+class Finder:
+    """Finds regions that move in the world, frame by frame."""
+
+    def __init__(self, rig: StereoRig, config: ImmConfig, size: tuple[int, int]) -> None:
+        self._rig, self._config = rig, config
+        focal, most = rig.left.K[0, 0], 1.0
+        wanted = focal * rig.baseline / most
+        self._disparities = int(np.clip(np.ceil(min(wanted, size[0] / 2) / 16) * 16, 16, 192))
+        turned = not np.allclose(rig.R, np.eye(3), atol=1e-9) or abs(rig.T[1]) + abs(rig.T[2]) > 1e-9
+        self._maps = self._rectified(size) if turned or not np.allclose(rig.left.K, rig.right.K) else None
+        self._matcher = cv2.StereoSGBM_create(  # type: ignore[attr-defined]
+            0, self._disparities, 5, 8 * 25, 32 * 25, 1, 31, 10, 60, 2
+        )
+        self._candidates: list[_Candidate] = []
+
+    def _rectified(self, size: tuple[int, int]) -> tuple[tuple[Array, Array], tuple[Array, Array], Array, Array]:
+        rig = self._rig
+        none = np.zeros(5)
+        R1, R2, P1, _, Q, _, _ = cv2.stereoRectify(rig.left.K, none, rig.right.K, none, size, rig.R, rig.T, alpha=0)
+        maps = [
+            cv2.initUndistortRectifyMap(K, none, R, P1[:, :3], size, cv2.CV_32FC1)
+            for K, R in ((rig.left.K, R1), (rig.right.K, R2))
+        ]
+        return maps[0], maps[1], R1, P1[:, :3]
+
+    def depth(self, left: Image, right: Image) -> Array:
+        """Depth (H, W) m of the left view; infinite where nothing is known."""
+        if self._maps is None:
+            disparity = self._matcher.compute(left, right).astype(float) / 16
+            focal = self._rig.left.K[0, 0]
+            return np.where(disparity > 0.5, focal * self._rig.baseline / np.maximum(disparity, 0.5), np.inf)
+        one, other, R1, K = self._maps
+        pair = [cv2.remap(view, *maps, cv2.INTER_LINEAR) for view, maps in ((left, one), (right, other))]
+        disparity = self._matcher.compute(*pair).astype(np.float32) / 16
+        depth = np.where(disparity > 0.5, K[0, 0] * self._rig.baseline / np.maximum(disparity, 0.5), np.inf)
+        # Back to the left view: where each of its pixels lies in the rectified picture.
+        high, wide = depth.shape
+        u, v = np.meshgrid(np.arange(wide, dtype=float), np.arange(high, dtype=float))
+        rays = np.stack([u, v, np.ones_like(u)], axis=-1) @ np.linalg.inv(self._rig.left.K).T @ R1.T
+        at = rays @ K.T
+        at = (at[..., :2] / at[..., 2:]).astype(np.float32)
+        near = cv2.remap(depth.astype(np.float32), at[..., 0], at[..., 1], cv2.INTER_NEAREST, borderValue=np.inf)
+        return np.asarray(near / np.maximum(rays[..., 2], 1e-6), dtype=float)
+
+    def look(
+        self, picture: Image, depth: Array, flow: Array, before: Head, now: Head, known: list[Array]
+    ) -> list[tuple[Array, Array]]:
+        """Left quads (4, 2) px and world velocities (3,) m/s of regions that moved for some frames, none `known` [x, y, w, h].
+
+        depth (H, W) m is that of the frame before, flow (H, W, 2) px leads from it to this one.
+        """
+        R, t = now.R.T @ before.R, now.R.T @ (before.T - now.T)
+        rest = flow - own_motion(depth, self._rig.left.K, R, t)
+        usable = np.isfinite(depth) & (depth < FARTHEST_M) & np.isfinite(rest).all(axis=-1)
+        if np.count_nonzero(usable) < 200:
+            return []
+        middle = np.median(rest[usable], axis=0)
+        spread = 1.4826 * np.median(np.abs(rest[usable] - middle))
+        # Near things have more flow, and so more of its error.
+        explained = np.linalg.norm(flow - rest, axis=-1)
+        least = self._config.segmentation.residual_px + 3 * spread + 0.12 * np.nan_to_num(explained)
+        mask = (usable & (np.linalg.norm(rest - middle, axis=-1) > least)).astype(np.uint8)
+        mask = cv2.morphologyEx(mask, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
+        mask = cv2.morphologyEx(mask, cv2.MORPH_CLOSE, np.ones((7, 7), np.uint8))
+        regions = self._regions(np.asarray(mask, np.uint8), rest, depth, picture)
+        return self._confirmed(regions, depth, rest, now.t - before.t, now, known)
+
+    def _regions(self, mask: Image, rest: Array, depth: Array, picture: Image) -> list[tuple[Array, Array]]:
+        """Boxes [u0, v0, u1, v1] and masks (H, W) of clusters of moving pixels. Jia 2008, sec. 2."""
+        v, u = np.nonzero(mask)
+        settings = self._config.segmentation
+        least = settings.smallest * mask.size
+        if len(u) < least:
+            return []
+        step = max(1, len(u) // SAMPLES)
+        v, u = v[::step], u[::step]
+        features = np.column_stack([rest[v, u], u, v, picture[v, u][:, ::-1]]).astype(float)
+        weights = clusters.WEIGHTS.copy()
+        if np.ptp(picture[v, u].astype(int), axis=1).max() < 4:
+            weights[4:] = 1e-3  # grey footage: one brightness told thrice
+        labels = clusters.segmented(clusters.whitened(features, weights), settings.most, settings.clusters)
+        found = []
+        for label in np.unique(labels):
+            own = np.zeros_like(mask)
+            own[v[labels == label], u[labels == label]] = 1
+            own = cv2.dilate(own, np.ones((2 * step + 1, 2 * step + 1), np.uint8)) & mask
+            _, parts, blobs, _ = cv2.connectedComponentsWithStats(own)
+            for k, (x, y, w, h, area) in enumerate(blobs[1:], start=1):
+                if area >= least and area > FILLED * w * h and min(w, h) >= 8:
+                    found.append((np.array([x - 0.5, y - 0.5, x + w - 0.5, y + h - 0.5]), parts == k))
+        return found
+
+    def _confirmed(
+        self, regions: list[tuple[Array, Array]], depth: Array, rest: Array, dt: float, now: Head, known: list[Array]
+    ) -> list[tuple[Array, Array]]:
+        held = [np.array([box[0], box[1], box[0] + box[2], box[1] + box[3]]) for box in known]
+        kept, ready = [], []
+        for box, own in regions:
+            if any(_shared(box, other) > 0.3 for other in held):
+                continue
+            motion = np.median(rest[own], axis=0)
+            away = float(np.median(depth[own]))
+            velocity = now.R @ np.array([*(motion / np.diag(self._rig.left.K)[:2] * away / dt), 0.0])
+            if np.linalg.norm(velocity) < SLOWEST:
+                continue
+            before = next((c for c in self._candidates if _shared(c.box, box) > 0.4), None)
+            alike = before is not None and float(before.motion @ motion) > 0
+            candidate = _Candidate(box, before.seen + 1 if before is not None and alike else 1, motion)
+            if candidate.seen >= self._config.life.confirm_frames:
+                u0, v0, u1, v1 = box
+                ready.append((np.array([[u0, v0], [u1, v0], [u1, v1], [u0, v1]]), velocity))
+            else:
+                kept.append(candidate)
+        self._candidates = kept
+        return ready
+
+
+def _shared(box: Array, other: Array) -> float:
+    inner = np.clip(np.minimum(box[2:], other[2:]) - np.maximum(box[:2], other[:2]), 0, None)
+    return float(np.prod(inner) / max(min(np.prod(box[2:] - box[:2]), np.prod(other[2:] - other[:2])), 1e-9))
