@@ -14,12 +14,12 @@ from visfuse_cli.moving.models import Bank, Models, P, Step, V
 from visfuse_cli.moving.settings import ImmConfig
 from visfuse_cli.records import Array, Gaussian, StereoRig
 from visfuse_cli.vision import patches
+from visfuse_cli.vision.disparity import region_shift
 from visfuse_cli.vision.patches import Grey, Template
 
 STEP = 1e-3  # m, m/s: of the numerical Jacobian
 GATE = 1 - 1e-7
 SEARCH = 0.8  # of its size: how far around the prediction a lost target is looked for
-ACROSS = 0.05  # log stretch across the views
 TRUST = 4.0  # times an alignment's own covariance
 
 
@@ -92,6 +92,9 @@ def start(
     given: bool,
 ) -> Target | None:
     """Begin with a target in left and right quads (4, 2) px; None where it lies behind the camera."""
+    shifted = region_shift(views, left, (right - left).mean(axis=0), config.measure.good)
+    if shifted is not None:
+        right = left + shifted[0]
     place = triangulated(rig, left.mean(axis=0), right.mean(axis=0))
     if not np.isfinite(place).all() or place[2] <= 0.1:
         return None
@@ -161,16 +164,13 @@ def _look(target: Target, views: dict[str, list[Grey]], quads: dict[str, Array])
         if found is None or found.correlation < good:
             return None
     left = found.quad(left)
-    right = left + (quads["right"] - quads["left"]).mean(axis=0)
-    if not (patches.inside(left, size, 0) and patches.inside(right, size, 0)):
-        return None
-    across = patches.align(views["right"], right, patches.template(views["left"], left), ACROSS)
-    if across is None or across.correlation < good:
+    shift = region_shift(views, left, (quads["right"] - quads["left"]).mean(axis=0), good)
+    if shift is None:
         return None
     R = np.zeros((4, 4))
     R[:2, :2] = TRUST * found.cov[:2, :2]
-    R[2:, 2:] = TRUST * across.cov[:2, :2]
-    return left, across.quad(right), R
+    R[2:, 2:] = np.diag(shift[1])
+    return left, left + shift[0], R
 
 
 def _searched(target: Target, levels: list[Grey], quad: Array) -> Array | None:
