@@ -1,4 +1,4 @@
-"""Where a camera on wheels is: wheel speeds to poses, poses in between, and what is not known of them (Jia 2008, sec. 3).
+"""Where a camera on wheels is: wheel speeds to poses, poses in between, their covariance (Jia 2008, sec. 3).
 
 World: x right, y down, z forward; theta is the yaw to the left. The optical axis is (-sin theta, 0, cos theta).
 """
@@ -51,11 +51,9 @@ def driven(t: Array, left: Array, right: Array, separation: float, at: Array) ->
     step = chord[:, None] * np.stack([-np.sin(course), np.zeros_like(course), np.cos(course)], axis=1)
     place = np.concatenate([np.zeros((1, 3)), np.cumsum(step, axis=0)])
     start = int(np.searchsorted(knots, t[0]))
-    heading, place = heading - heading[start], place - place[start]
-    c, s = np.cos(heading[start]), np.sin(heading[start])
-    assert abs(c - 1) + abs(s) < 1e-9
+    turned, place = heading - heading[start], (place - place[start]) @ rotation(heading[start])
     index = np.searchsorted(knots, at)
-    return heading[index], place[index]
+    return turned[index], place[index]
 
 
 def from_wheels(
