@@ -179,8 +179,8 @@ def _check_size(calibration: Path, rig: StereoRig, size: tuple[int, int]) -> Non
     middle = rig.left.K[:2, 2] / np.array(size)
     if np.any(middle < 0.15) or np.any(middle > 0.85):
         raise InputError(
-            f"{calibration}: M1 has its principal point at ({rig.left.K[0, 2]:.0f}, {rig.left.K[1, 2]:.0f}), which is not "
-            f"near the middle of {size[0]}x{size[1]} footage; it was made for another size"
+            f"{calibration}: M1 has its principal point at ({rig.left.K[0, 2]:.0f}, {rig.left.K[1, 2]:.0f}), "
+            f"which is not near the middle of {size[0]}x{size[1]} footage; it was made for another size"
         )
 
 
@@ -282,7 +282,8 @@ def _follow(
                 depth = finder.depth(grey, np.asarray(views["right"][0], np.uint8))
             if before is not None and before[2] is not None and flow is not None:
                 with run_.stage("newcomers"):
-                    known = [each.history[-1].boxes["left"] for each in followed if "left" in each.history[-1].boxes]
+                    boxes = [each.history[-1].boxes for each in followed]
+                    known = [each["left"] for each in boxes if "left" in each]
                     found = finder.look(pictures["left"], before[2], flow, before[0], head, known)
                 for quad, velocity in found:
                     right = match(scene.rig, views, quad, config.measure.good)
@@ -307,7 +308,7 @@ def _check_covered(scene: _Scene, t: float) -> None:
     first, last = float(scene.sensors.t[0]), float(scene.sensors.t[-1])
     if t > last + BEYOND_S or t < first - BEYOND_S:
         raise InputError(
-            f"{scene.files[1]}: samples run from t = {first:g} to {last:g} s, but the footage has a frame at {t:.2f} s; "
+            f"{scene.files[1]}: samples run from t = {first:g} to {last:g} s, the footage has a frame at {t:.2f} s; "
             "times count from the first frame"
         )
 

@@ -94,6 +94,6 @@ def _gaps(path: Path, t: Array) -> tuple[str, ...]:
         return ()
     k = int(long[np.argmax(dt[long])])
     return (
-        f"{path}: {len(long)} gap{'s' if len(long) > 1 else ''} in the samples, the longest {dt[k]:.1f} s after t = {t[k]:g}; "
-        "the motion is interpolated there",
+        f"{path}: {len(long)} gap{'s' if len(long) > 1 else ''} in the samples, the longest {dt[k]:.1f} s "
+        f"after t = {t[k]:g}; the motion is interpolated there",
     )

@@ -26,7 +26,7 @@ class Extension:
     variance: Array
 
     def extended(self, belief: Gaussian) -> Gaussian:
-        """The belief (..., n) as one of the common state (..., N): what is not held is zero, with an honest variance."""
+        """The belief (..., n) as one of the common state (..., N); what is not held is zero, with its variance."""
         size = len(self.variance)
         held = np.zeros(size, dtype=bool)
         held[list(self.index)] = True

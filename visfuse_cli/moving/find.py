@@ -1,4 +1,4 @@
-"""What moves by itself: flow that the camera's motion leaves over, gathered into regions of one motion, place, colour."""
+"""What moves by itself: flow that the camera's motion leaves over, in regions of one motion, place and colour."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class Finder:
     def _rectified(self, size: tuple[int, int]) -> tuple[tuple[Array, Array], tuple[Array, Array], Array, Array]:
         rig = self._rig
         none = np.zeros(5)
-        R1, R2, P1, _, Q, _, _ = cv2.stereoRectify(rig.left.K, none, rig.right.K, none, size, rig.R, rig.T, alpha=0)
+        R1, R2, P1, _, _, _, _ = cv2.stereoRectify(rig.left.K, none, rig.right.K, none, size, rig.R, rig.T, alpha=0)
         maps = [
             cv2.initUndistortRectifyMap(K, none, R, P1[:, :3], size, cv2.CV_32FC1)
             for K, R in ((rig.left.K, R1), (rig.right.K, R2))
@@ -73,9 +73,10 @@ class Finder:
     def look(
         self, picture: Image, depth: Array, flow: Array, before: Head, now: Head, known: list[Array]
     ) -> list[tuple[Array, Array]]:
-        """Left quads (4, 2) px and world velocities (3,) m/s of regions that moved for some frames, none `known` [x, y, w, h].
+        """Left quads (4, 2) px and world velocities (3,) m/s of regions that moved for some frames, none `known`.
 
-        depth (H, W) m is that of the frame before, flow (H, W, 2) px leads from it to this one.
+        known are boxes [x, y, w, h]; depth (H, W) m is that of the frame before, flow (H, W, 2) px
+        leads from it to this one.
         """
         R, t = now.R.T @ before.R, now.R.T @ (before.T - now.T)
         rest = flow - own_motion(depth, self._rig.left.K, R, t)

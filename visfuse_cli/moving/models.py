@@ -37,7 +37,7 @@ class Bank:
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """What a backward pass needs of one instant: mixed beliefs before, F, predicted and filtered beliefs, probabilities."""
+    """What a backward pass needs of one instant: beliefs mixed, predicted and filtered, F, and log probabilities."""
 
     mixed: tuple[Gaussian, ...]
     F: tuple[Array, ...]

@@ -151,15 +151,16 @@ def _expected_quads(target: Target) -> dict[str, Array] | None:
 
 
 def _look(target: Target, views: dict[str, list[Grey]], quads: dict[str, Array]) -> tuple[Array, Array, Array] | None:
-    """Left and right quads (4, 2) where the target is seen, and the noise (4, 4) of both middles; None where it is not."""
+    """Left and right quads (4, 2) where the target is seen, and the noise (4, 4) of both middles; or None."""
     size = views["left"][0].shape[1], views["left"][0].shape[0]
     left = quads["left"]
     good = target.config.measure.good
     found = patches.align(views["left"], left, target.sought, 0.2) if patches.inside(left, size, 0) else None
     if found is None or found.correlation < good:
-        left = _searched(target, views["left"], left)
-        if left is None or not patches.inside(left, size, 0):
+        moved = _searched(target, views["left"], left)
+        if moved is None or not patches.inside(moved, size, 0):
             return None
+        left = moved
         found = patches.align(views["left"], left, target.sought, 0.2)
         if found is None or found.correlation < good:
             return None

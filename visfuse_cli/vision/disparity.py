@@ -1,4 +1,4 @@
-"""The disparity of one target's region: cells of it found in the other view, the middle one believed (Jia 2008, sec. 3).
+"""The disparity of one target's region: cells of it found in the other view (Jia 2008, sec. 3).
 
 A target is not flat, and its box holds background too: the median over cells leaves both out, where one match of the
 whole region would be drawn to whatever has the strongest edges.
@@ -19,7 +19,7 @@ BACK_PX = 1.0  # by which looking back from the right view may miss
 
 
 def region_shift(views: dict[str, list[Grey]], left: Array, start: Array, good: float) -> tuple[Array, Array] | None:
-    """How the region of a left quad (4, 2) is shifted (2,) px in the right view, near `start` (2,), and its variances (2,).
+    """The shift (2,) px of a left quad's region (4, 2) in the right view, near `start` (2,), and its variances (2,).
 
     Every cell is found by its grey values, looked for back again, and dropped where that ends elsewhere. None where
     fewer than two cells are left.
