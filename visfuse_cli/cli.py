@@ -210,6 +210,41 @@ def report(
         typer.echo(f"{'report':<12} {page}")
 
 
+@app.command("evaluate")
+def evaluate(
+    run: Annotated[Path, typer.Argument(metavar="RUN", help="Folder that a tracking command wrote.")],
+    truth: Annotated[
+        Path | None, typer.Option("--truth", metavar="FILE", help="truth.csv: frame,t,id,x,y,z,vx,vy,vz.")
+    ] = None,
+    reference: Annotated[
+        Path | None, typer.Option("--reference", metavar="FILE", help="radar.csv: t,speed_kmh[,direction,lane].")
+    ] = None,
+    gate: Annotated[
+        float, typer.Option("--gate", metavar="M", help="Metres within which a state is a true one's.")
+    ] = 1.0,
+    plane: Annotated[bool, typer.Option("--plane", help="Compare positions on the ground only.")] = False,
+    as_json: JsonOption = False,
+    quiet: QuietOption = False,
+) -> None:
+    """Errors, coverage, consistency and identities of a run, against truth or a radar, or by itself.
+
+    Example: visfuse evaluate run --truth truth.csv --gate 0.5
+    """
+    from visfuse_cli.errors import UsageError
+    from visfuse_cli.evaluate.run import evaluate as judge
+    from visfuse_cli.evaluate.run import text
+
+    if truth is not None and reference is not None:
+        raise UsageError("--truth and --reference: give one of them")
+    if not gate > 0:
+        raise UsageError(f"--gate {gate:g}: must be above zero, metres")
+    found = judge(run, truth, reference, gate, plane)
+    if as_json:
+        typer.echo(json.dumps(found, allow_nan=False))
+    elif not (quiet or _quiet):
+        typer.echo(text(found))
+
+
 @app.command("summary")
 def summary(
     log: Annotated[Path, typer.Argument(metavar="F.sqlite", help="A traffic log, written by speed --log.")],
