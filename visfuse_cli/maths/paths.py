@@ -28,11 +28,11 @@ class Way:
         self.s = np.concatenate([[0.0], np.cumsum(step)])
         self._curve = CubicSpline(self.s, points, bc_type="natural") if len(points) > 2 else None
         self._points = points
-        if self._curve is not None:  # chords are shorter than the arc: measure the spline, and fit it again
-            fine = np.linspace(0, self.s[-1], 40 * len(points))
+        if self._curve is not None:  # chords are shorter than the arc: measure the spline, and lay knots evenly on it
+            fine = np.linspace(0, self.s[-1], 100 * len(points))
             length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(self._curve(fine), axis=0), axis=1))])
-            self.s = np.interp(self.s, fine, length)
-            self._curve = CubicSpline(self.s, points, bc_type="natural")
+            self.s = np.linspace(0, length[-1], 6 * len(points))
+            self._curve = CubicSpline(self.s, self._curve(np.interp(self.s, length, fine)), bc_type="natural")
 
     @property
     def length(self) -> float:
