@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
@@ -54,13 +54,6 @@ class Pairs:
     y: Array
     R: Array
     lone: NDArray[np.bool_]
-
-
-@dataclass(slots=True)
-class Banks:
-    """The local filters of fusion without feedback, by person; empty for the closed loop."""
-
-    by_person: dict[int, Bank] = field(default_factory=dict)
 
 
 def at_one_time(sights: Sights, P: Array, beliefs: Gaussian) -> Sights:
