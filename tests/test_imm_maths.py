@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tests.drives import stacked
 from visfuse_cli.maths import course, gaussian, imm, motion, odometry
-from visfuse_cli.maths.imm import Extension
 from visfuse_cli.maths.smoothing import rauch_tung_striebel
 from visfuse_cli.moving.models import Models
 from visfuse_cli.moving.settings import FilterSettings
@@ -63,7 +63,17 @@ def test_constant_speed_goes_over_into_a_straight_as_the_rate_vanishes():
     np.testing.assert_allclose(turned[:4], straight[:4], atol=1e-8)
 
 
-def test_copies_of_one_model_are_that_models_kalman_filter():
+def linear(F, Q):
+    return lambda x: (gaussian.times(F, x), F, Q)
+
+
+def some_belief(rng: np.random.Generator, *shape: int) -> Gaussian:
+    n = shape[-1]
+    A = rng.normal(size=(*shape, n))
+    return Gaussian(rng.normal(size=shape), A @ np.swapaxes(A, -1, -2) + np.eye(n))
+
+
+def test_copies_of_one_model_are_that_models_kalman_filter_and_smoother():
     rng = np.random.default_rng(2)
     F, Q, H, R = (
         motion.constant_velocity(0.1, 2),
@@ -71,64 +81,91 @@ def test_copies_of_one_model_are_that_models_kalman_filter():
         np.eye(2, 4),
         0.04 * np.eye(2),
     )
-    extension = Extension((0, 1, 2, 3), np.ones(4))
     single = Gaussian(np.zeros(4), np.eye(4))
-    beliefs, log_mu = [single] * 3, np.log(np.array([0.2, 0.5, 0.3]))
+    bank = imm.Bank(imm.start(single, 3).beliefs, np.log(np.array([0.2, 0.5, 0.3])))
     log_p = imm.transition(3, 0.9)
+    steps, filtered, predicted = [], [], []
     for _ in range(20):
         z = rng.normal(size=2)
-        single = gaussian.predict(single, F, Q)
-        single, _ = gaussian.update(single, z - single.mean[:2], H, R)
-        beliefs, ahead = imm.mix(beliefs, log_mu, log_p, [extension] * 3)
-        found = [gaussian.update(p, z - p.mean[:2], H, R) for p in (gaussian.predict(b, F, Q) for b in beliefs)]
-        beliefs = [b for b, _ in found]
-        log_mu = imm.weigh(ahead, np.array([float(i.log_likelihood) for _, i in found]))
-        assert np.exp(log_mu).sum() == pytest.approx(1)
-    both = imm.combined(beliefs, log_mu, [extension] * 3)
+        predicted.append(gaussian.predict(single, F, Q))
+        single, _ = gaussian.update(predicted[-1], z - predicted[-1].mean[:2], H, R)
+        filtered.append(single)
+        step = imm.predict(bank, log_p, linear(np.tile(F, (3, 1, 1)), Q))
+        step, _ = imm.update(step, z - step.predicted.mean[:, :2], H, R)
+        steps.append(step)
+        bank = step.filtered
+        assert np.exp(bank.log_mu).sum() == pytest.approx(1)
+    both = imm.combined(bank)
     np.testing.assert_allclose(both.mean, single.mean, atol=1e-10)
     np.testing.assert_allclose(both.cov, single.cov, atol=1e-10)
+    wanted = rauch_tung_striebel(stacked(filtered), stacked(predicted), np.tile(F, (20, 1, 1)))
+    found = stacked([imm.combined(bank) for bank in imm.smooth(steps, log_p)])
+    np.testing.assert_allclose(found.mean, wanted.mean, atol=1e-9)
+    np.testing.assert_allclose(found.cov, wanted.cov, atol=1e-9)
 
 
 @settings(max_examples=25, deadline=None)
 @given(st.integers(0, 1000))
-def test_mixing_leaves_the_mean_of_what_is_common_unchanged(seed):
+def test_mixing_keeps_the_moments_of_all_models_together(seed):
     rng = np.random.default_rng(seed)
-    variance = np.repeat([1.0, 4.0, 9.0], 2)
-    short, long = Extension((0, 1, 2, 3), variance), Extension(tuple(range(6)), variance)
-
-    def belief(n):
-        A = rng.normal(size=(n, n))
-        return Gaussian(rng.normal(size=n), A @ A.T + np.eye(n))
-
-    beliefs, log_mu = [belief(4), belief(6)], np.log(np.array([0.3, 0.7]))
-    mixed, ahead = imm.mix(beliefs, log_mu, imm.transition(2, 0.8), [short, long])
-    before = 0.3 * beliefs[0].mean + 0.7 * beliefs[1].mean[:4]
-    c = np.exp(ahead)
-    np.testing.assert_allclose(c[0] * mixed[0].mean + c[1] * mixed[1].mean[:4], before, atol=1e-10)
-    for each in mixed:
-        assert np.linalg.eigvalsh(each.cov).min() > 0
+    bank = imm.Bank(some_belief(rng, 2, 3, 5), np.log(rng.dirichlet(np.ones(3), 2)))
+    log_p = np.log(rng.dirichlet(np.ones(3), 3))
+    mixed, ahead = imm.mix(bank, log_p)
+    before, after = imm.combined(bank), imm.combined(imm.Bank(mixed, ahead))
+    np.testing.assert_allclose(after.mean, before.mean, atol=1e-10)
+    np.testing.assert_allclose(after.cov, before.cov, atol=1e-9)
+    np.testing.assert_allclose(np.exp(ahead).sum(axis=-1), 1, atol=1e-12)
+    assert np.linalg.eigvalsh(mixed.cov).min() > 0
 
 
-def test_with_one_model_the_backward_pass_is_rauch_tung_striebels():
-    rng = np.random.default_rng(4)
-    models = Models(FilterSettings(kind="cv"))
-    bank = models.start(Gaussian(np.zeros(3), np.eye(3)), np.zeros(3))
-    steps, filtered, predicted = [], [], []
-    H, R = np.eye(3, 6), 0.01 * np.eye(3)
-    F = motion.constant_velocity(0.1, 3)
-    for k in range(15):
-        ahead, step = models.predict(bank, 0.1)
-        z = np.array([0.1 * k, 0, 0]) + 0.1 * rng.normal(size=3)
-        after, _ = gaussian.update(ahead.beliefs[0], z - ahead.beliefs[0].mean[:3], H, R)
-        predicted.append(ahead.beliefs[0])
-        filtered.append(after)
-        bank = type(bank)((after,), bank.log_mu)
-        steps.append(type(step)(step.mixed, step.F, step.predicted, bank, step.ahead))
-    stack = [Gaussian(np.stack([b.mean for b in bs]), np.stack([b.cov for b in bs])) for bs in (filtered, predicted)]
-    wanted = rauch_tung_striebel(stack[0], stack[1], np.tile(F, (15, 1, 1)))
-    found, _ = models.smoothed(steps)
-    np.testing.assert_allclose(np.stack([b.mean[:6] for b in found]), wanted.mean, atol=1e-9)
-    np.testing.assert_allclose(np.stack([b.cov[:6, :6] for b in found]), wanted.cov, atol=1e-9)
+@settings(max_examples=25, deadline=None)
+@given(st.integers(0, 1000), st.permutations([0, 1, 2]), st.floats(0.01, 100))
+def test_an_instant_does_not_depend_on_the_models_order_nor_on_units(seed, order, unit):
+    rng = np.random.default_rng(seed)
+    log_p, order = imm.transition(3, 0.9), list(order)
+    F = np.eye(4) + 0.1 * rng.normal(size=(3, 4, 4))
+    Q, H, R = some_belief(rng, 3, 4).cov, rng.normal(size=(2, 4)), np.diag([0.5, 0.2])
+    z = rng.normal(size=2)
+
+    def after(beliefs, log_mu, scale, rows):
+        U = scale * np.eye(4)
+        bank = imm.Bank(Gaussian(scale * beliefs.mean[rows], scale**2 * beliefs.cov[rows]), log_mu[rows])
+        step = imm.predict(bank, log_p, linear(F[rows], U @ Q[rows] @ U))
+        step, _ = imm.update(step, scale * z - gaussian.times(H, step.predicted.mean), H, scale**2 * R)
+        return imm.combined(step.filtered), step.filtered.log_mu
+
+    beliefs, log_mu = some_belief(rng, 3, 4), np.log(rng.dirichlet(np.ones(3)))
+    plain, plain_mu = after(beliefs, log_mu, 1.0, [0, 1, 2])
+    other, other_mu = after(beliefs, log_mu, unit, order)
+    np.testing.assert_allclose(other.mean, unit * plain.mean, rtol=1e-7, atol=1e-9 * unit)
+    np.testing.assert_allclose(other.cov, unit**2 * plain.cov, rtol=1e-6, atol=1e-9 * unit**2)
+    np.testing.assert_allclose(other_mu, plain_mu[order], atol=1e-8)
+
+
+def test_a_short_model_in_the_common_state_is_that_model():
+    rng = np.random.default_rng(9)
+    spare = np.repeat([1.0, 4.0, 9.0], 2)
+    small = motion.constant_velocity(0.1, 2), motion.constant_velocity_noise(0.1, 0.3, 2)
+    F, Q = imm.embedded(*small, range(4), spare)
+    wide = some_belief(rng, 6)
+    alone = Gaussian(wide.mean[:4], wide.cov[:4, :4])
+    H, R, z = np.eye(2, 6), 0.1 * np.eye(2), rng.normal(size=2)
+    wide = gaussian.predict(wide, F, Q)
+    wide, first = gaussian.update(wide, z - wide.mean[:2], H, R)
+    alone = gaussian.predict(alone, *small)
+    alone, second = gaussian.update(alone, z - alone.mean[:2], H[:, :4], R)
+    np.testing.assert_allclose(wide.mean, [*alone.mean, 0, 0], atol=1e-12)
+    np.testing.assert_allclose(wide.cov[:4, :4], alone.cov, atol=1e-12)
+    np.testing.assert_allclose(wide.cov[4:, 4:], np.diag(spare[4:]), atol=1e-12)
+    assert first.log_likelihood == pytest.approx(second.log_likelihood)
+
+
+def test_the_periodic_model_swings_about_its_own_centre():
+    models = Models(FilterSettings(kind="periodic"))
+    bank = models.start(Gaussian(np.array([7.0, 0, 0]), np.eye(3)), np.zeros(3))
+    bank.beliefs.mean[0, 9] = 2.0  # 2 m to the right of its centre
+    ahead = imm.combined(models.predict(bank, np.pi).filtered)  # half a swing at 1 rad/s
+    np.testing.assert_allclose(ahead.mean[[0, 9]], [3.0, -2.0], atol=1e-9)
 
 
 def test_wheels_on_a_closed_circle_return_to_their_start():

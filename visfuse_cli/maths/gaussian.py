@@ -52,8 +52,10 @@ def innovate(belief: Gaussian, residual: Array, H: Array, R: Array) -> tuple[Inn
     """
     H_P = H @ belief.cov
     S = symmetrise(H_P @ transpose(H) + R)
-    gain = transpose(np.linalg.solve(S, H_P))
-    nis, log_likelihood = _density(residual, S)
+    solved = np.linalg.solve(S, np.concatenate([H_P, np.broadcast_to(residual, H_P.shape[:-1])[..., None]], axis=-1))
+    gain = transpose(solved[..., :-1])
+    nis = np.sum(residual * solved[..., -1], axis=-1)
+    log_likelihood = -0.5 * nis - _log_normaliser(np.linalg.cholesky(S))
     return Innovation(np.broadcast_to(residual, nis.shape + S.shape[-1:]), S, nis, log_likelihood), gain
 
 
@@ -93,8 +95,12 @@ def _density(residual: Array, cov: Array) -> tuple[Array, Array]:
     L = np.linalg.cholesky(cov)
     whitened = np.linalg.solve(L, residual[..., None])[..., 0]
     distance = np.sum(whitened**2, axis=-1)
-    log_root_det = np.sum(np.log(np.diagonal(L, axis1=-2, axis2=-1)), axis=-1)
-    return distance, -0.5 * distance - log_root_det - 0.5 * cov.shape[-1] * np.log(2 * np.pi)
+    return distance, -0.5 * distance - _log_normaliser(L)
+
+
+def _log_normaliser(L: NDArray[Any]) -> Array:
+    """log of sqrt(det(2 pi S)) (...) from the Cholesky factors (..., n, n) of S."""
+    return np.sum(np.log(np.diagonal(L, axis1=-2, axis2=-1)), axis=-1) + 0.5 * L.shape[-1] * np.log(2 * np.pi)
 
 
 def moment_match(means: Array, covs: Array, log_weights: Array, angles: tuple[int, ...] = ()) -> Gaussian:

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from visfuse_cli.maths import imm
 from visfuse_cli.moving.models import P, V
 from visfuse_cli.moving.target import Target
 from visfuse_cli.records import Array, Gaussian
@@ -46,10 +47,10 @@ def conclude(target: Target, pose_cov: Array) -> Settled | None:
     last = int(np.flatnonzero(measured)[-1]) + 1
     history, measured = target.history[:last], measured[:last]
     if target.config.smooth:
-        common, log_mu = target.models.smoothed([seen.step for seen in history])
+        banks = target.models.smoothed([seen.step for seen in history])
     else:
-        common = [target.models.combined(seen.step.filtered) for seen in history]
-        log_mu = [seen.step.filtered.log_mu for seen in history]
+        banks = [seen.step.filtered for seen in history]
+    common = [imm.combined(bank) for bank in banks]
     mean = np.stack([belief.mean for belief in common])[:, :6]
     cov = np.stack([belief.cov for belief in common])[:, :6, :6]
     nis = np.array([seen.nis for seen in history])[measured]
@@ -58,7 +59,7 @@ def conclude(target: Target, pose_cov: Array) -> Settled | None:
         frame=[seen.frame for seen in history],
         t=np.array([seen.t for seen in history]),
         belief=Gaussian(mean, cov + _of_pose(mean, pose_cov[:last], history)),
-        log_mu=np.stack(log_mu),
+        log_mu=np.stack([bank.log_mu for bank in banks]),
         names=target.models.names,
         boxes=[seen.boxes for seen in history],
         measured=measured,

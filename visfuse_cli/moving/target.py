@@ -7,10 +7,11 @@ from dataclasses import dataclass, field
 import cv2
 import numpy as np
 
-from visfuse_cli.maths import gaussian
+from visfuse_cli.maths import imm
 from visfuse_cli.maths.assignment import gate_size
+from visfuse_cli.maths.imm import Bank, Step
 from visfuse_cli.maths.planes import in_right, projected, triangulated
-from visfuse_cli.moving.models import Bank, Models, P, Step, V
+from visfuse_cli.moving.models import SIZE, Models, P, V
 from visfuse_cli.moving.settings import ImmConfig
 from visfuse_cli.records import Array, Gaussian, StereoRig
 from visfuse_cli.vision import patches
@@ -75,7 +76,7 @@ class Target:
     @property
     def belief(self) -> Gaussian:
         """The common belief (12,)."""
-        return self.models.combined(self.bank)
+        return imm.combined(self.bank)
 
 
 def start(
@@ -107,7 +108,8 @@ def start(
     target = Target(
         identity, rig, config, models, bank, size, patches.template(views["left"], left), head, given, head.t
     )
-    first = Step(bank.beliefs, tuple(np.eye(len(b.mean)) for b in bank.beliefs), bank.beliefs, bank, bank.log_mu)
+    nothing = np.zeros_like(bank.beliefs.cov)
+    first = Step(bank.beliefs, nothing + np.eye(SIZE), nothing, bank.beliefs, bank.log_mu, bank)
     boxes = {"left": _box(left), "right": _box(right)}
     target.history.append(Seen(frame, head.t, head, boxes, True, first, 0.0, None))
     return target
@@ -116,26 +118,26 @@ def start(
 def follow(target: Target, views: dict[str, list[Grey]], flow: Array | None, frame: int, head: Head) -> None:
     """One frame further: predict, look, update. `flow` (H, W, 2) px since the frame before, where it is known."""
     before = target.head
-    ahead, step = target.models.predict(target.bank, head.t - before.t)
+    step = target.models.predict(target.bank, head.t - before.t)
     target.away += float(np.linalg.norm(head.T - before.T))
-    target.bank, target.head = ahead, head
+    target.bank, target.head = step.filtered, head
     quads = _expected_quads(target)
     found = _look(target, views, quads) if quads is not None else None
     nis, measured = 0.0, False
     if found is not None:
         left, right, R = found
         z, R = _measurement(target, left, right, R, flow, head.t - before.t)
-        updated = _updated(target, z, R, head, before)
+        updated = _updated(target, step, z, R, head, before)
         if updated is not None:
-            target.bank, nis = updated
+            step, nis = updated
+            target.bank = step.filtered
             measured, quads = True, {"left": left, "right": right}
             target.last_seen = head.t
             _refresh(target, views, left, head)
     boxes = {} if quads is None else {view: _box(quad) for view, quad in quads.items()}
-    step = Step(step.mixed, step.F, step.predicted, target.bank, step.ahead)
     later = None
     if target.config.latency > 0:
-        later = target.models.combined(target.models.predict(target.bank, target.config.latency)[0])
+        later = imm.combined(target.models.predict(target.bank, target.config.latency).filtered)
     target.history.append(Seen(frame, head.t, head, boxes, measured, step, nis, later))
 
 
@@ -239,27 +241,19 @@ def expected(rig: StereoRig, states: Array, head: Head, before: Head) -> Array:
     return np.concatenate([flow, left[..., :1] - right[..., :1], left], axis=-1)
 
 
-def _updated(target: Target, z: Array, R: Array, head: Head, before: Head) -> tuple[Bank, float] | None:
-    """Every model after the measurement; None where none of them can believe it."""
-    beliefs, likelihood, nis = [], [], []
-    for belief, extension in zip(target.bank.beliefs, target.models.extensions, strict=True):
-        common = extension.extended(belief).mean
-        tried = common + STEP * np.concatenate([np.zeros((1, 12)), np.eye(12)[:6], -np.eye(12)[:6]])
-        h = expected(target.rig, tried, head, before)
-        if not np.isfinite(h).all():
-            return None
-        J = np.zeros((5, 12))
-        J[:, :6] = ((h[1:7] - h[7:]) / (2 * STEP)).T
-        after, innovation = gaussian.update(belief, z - h[0], J[:, list(extension.index)], R)
-        beliefs.append(after)
-        likelihood.append(float(innovation.log_likelihood))
-        nis.append(float(innovation.nis))
-    if min(nis) > gate_size(5, GATE):
+def _updated(target: Target, step: Step, z: Array, R: Array, head: Head, before: Head) -> tuple[Step, float] | None:
+    """The step after the measurement, and how far that was off; None where no model can believe it."""
+    change = STEP * np.eye(6, SIZE)
+    tried = step.predicted.mean[:, None] + np.concatenate([np.zeros((1, SIZE)), change, -change])  # (r, 13, 12)
+    h = expected(target.rig, tried, head, before)
+    if not np.isfinite(h).all():
         return None
-    log_mu = target.bank.log_mu + np.array(likelihood)
-    log_mu = log_mu - log_mu.max()
-    log_mu = log_mu - np.log(np.sum(np.exp(log_mu)))
-    return Bank(tuple(beliefs), np.maximum(log_mu, -30.0)), float(np.exp(log_mu) @ np.array(nis))
+    J = np.zeros((len(h), len(z), SIZE))
+    J[:, :, :6] = np.swapaxes(h[:, 1:7] - h[:, 7:], 1, 2) / (2 * STEP)
+    updated, innovation = imm.update(step, z - h[:, 0], J, R)
+    if innovation.nis.min() > gate_size(len(z), GATE):
+        return None
+    return updated, float(np.exp(updated.filtered.log_mu) @ innovation.nis)
 
 
 def _refresh(target: Target, views: dict[str, list[Grey]], left: Array, head: Head) -> None:
