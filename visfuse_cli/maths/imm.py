@@ -74,6 +74,14 @@ def start(beliefs: Gaussian, models: int) -> Bank:
     return Bank(Gaussian(mean, cov), np.full((*shape[:-1], models), -np.log(models)))
 
 
+def at(step: Step, k: int) -> Step:
+    """The step of one of many tracks, the k-th along the first axis."""
+    mixed, predicted, after = (
+        Gaussian(b.mean[k], b.cov[k]) for b in (step.mixed, step.predicted, step.filtered.beliefs)
+    )
+    return Step(mixed, step.F[k], step.Q[k], predicted, step.ahead[k], Bank(after, step.filtered.log_mu[k]))
+
+
 def mix(bank: Bank, log_p: Array, angles: tuple[int, ...] = ()) -> tuple[Gaussian, Array]:
     """Each model's own starting point (..., r, N), and the log probabilities ahead (..., r). Jia 2008, eqs. 23-26.
 

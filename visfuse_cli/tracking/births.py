@@ -198,16 +198,16 @@ class Nursery:
     ) -> list[Step]:
         """Run the filter over the frames seen before confirmation, poses (n, 3) in them being roughly known."""
         start = self._dynamics.begin(np.append(fit.pose[0, :2], pose[0, 2]), velocity)
-        steps = [Step(start, start, np.eye(len(start.mean)), None, None)]
+        steps = [dynamics_tools.first(self._dynamics, start)]
         for k in range(1, len(samples)):
             dt = np.array([samples[k].t - samples[k - 1].t])
-            expected = dynamics_tools.predict(self._dynamics, [steps[-1].posterior], dt, size[:1])[0]
+            expected = dynamics_tools.predict(self._dynamics, steps[-1:], dt, size[:1])[0]
             if samples[k].measured and fit.ok[k]:
                 predicted = np.append(fit.pose[k, :2], pose[k, 2])
                 z, R = self._dynamics.measured(*measure.measurement(fit, k, predicted, HEADING_SIGMA))
-                steps.append(dynamics_tools.take(self._dynamics, expected, z, R, steps[-1].memory))
+                steps.append(dynamics_tools.take(self._dynamics, expected, z, R))
             else:
-                steps.append(dynamics_tools.coast(expected, steps[-1].memory))
+                steps.append(dynamics_tools.coast(expected))
         return steps
 
 

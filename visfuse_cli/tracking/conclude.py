@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +11,6 @@ from visfuse_cli.maths import homography
 from visfuse_cli.maths.assignment import gate_size
 from visfuse_cli.maths.cameras import project
 from visfuse_cli.maths.gaussian import mahalanobis, symmetrise
-from visfuse_cli.maths.smoothing import rauch_tung_striebel
 from visfuse_cli.records import Array, Gaussian, GroundCamera
 from visfuse_cli.tracking import dynamics as dynamics_tools
 from visfuse_cli.tracking import measure
@@ -64,7 +63,7 @@ def conclude(track: Track, camera: GroundCamera, settings: TrackerSettings, dyna
     class_name = track.prior_class.name
     measured = np.array([s.measured for s in samples])
     if settings.smooth:
-        heading = dynamics.heading(_smooth(steps, dynamics).mean)
+        heading = dynamics.heading(dynamics_tools.smooth(dynamics, steps).mean)
         rough = np.stack([step.posterior.mean for step in steps])
         pose = np.column_stack([rough[:, :2], heading])
         outlines = Outlines.stack([s.outline for s in samples])
@@ -76,7 +75,7 @@ def conclude(track: Track, camera: GroundCamera, settings: TrackerSettings, dyna
         misfit = float(np.median(fit.rms[used]))
         steps, measured = _filter_again(samples, steps, fit, pose, size, settings, dynamics)
         nis = _nis(steps)
-        belief: Gaussian = _smooth(steps, dynamics)
+        belief = dynamics_tools.smooth(dynamics, steps)
     else:
         belief = Gaussian(np.stack([s.posterior.mean for s in steps]), np.stack([s.posterior.cov for s in steps]))
     planar, J = dynamics.planar(belief.mean)
@@ -115,12 +114,6 @@ def _size_z(size: Array, class_name: str, settings: TrackerSettings) -> float:
 
 def _nis(steps: list[Step]) -> Array:
     return np.array([float(step.innovation.nis) for step in steps if step.innovation is not None])
-
-
-def _smooth(steps: list[Step], dynamics: Dynamics) -> Gaussian:
-    filtered = Gaussian(np.stack([s.posterior.mean for s in steps]), np.stack([s.posterior.cov for s in steps]))
-    predicted = Gaussian(np.stack([s.prior.mean for s in steps]), np.stack([s.prior.cov for s in steps]))
-    return rauch_tung_striebel(filtered, predicted, np.stack([s.F for s in steps]), dynamics.angles_x)
 
 
 def _filter_again(
@@ -175,27 +168,25 @@ def _filter(
     """One pass over settled poses, and which of them lay inside the gate; it begins knowing nearly nothing."""
     gate = gate_size(len(dynamics.H), settings.pose.gate)
     H = dynamics.H
-    belief = Gaussian(start.mean, start.cov * START_DOUBT**2)
-    steps: list[Step] = []
+    steps = [dynamics_tools.first(dynamics, Gaussian(start.mean, start.cov * START_DOUBT**2))]
     trusted = np.zeros(len(samples), dtype=bool)
     count = 0
     for k, now in enumerate(measured):
         dt = np.array([samples[k].t - samples[k - 1].t if k else 0.0])
-        expected = dynamics_tools.predict(dynamics, [belief], dt, np.array([length]))[0]
         # The record of residuals begins when the belief has settled: the first doubt is no sign of a manoeuvre.
-        memory = steps[-1].memory if count > SETTLING else None
-        step = dynamics_tools.coast(expected, memory)
+        before = steps[-1] if count > SETTLING else replace(steps[-1], memory=None)
+        expected = dynamics_tools.predict(dynamics, [before], dt, np.array([length]))[0]
+        step = dynamics_tools.coast(expected)
         if now is not None:
             z, R = now[0], now[1] * scale
             gamma = dynamics_tools.residual(dynamics, z, expected.prior.mean)
             nis = float(mahalanobis(gamma, H @ expected.prior.cov @ H.T + R))
             # Outside the gate a measurement counts less the further off it is: a bad start is left behind in the end.
-            step = dynamics_tools.take(dynamics, expected, z, R * max(1.0, nis / gate) ** 2, memory)
+            step = dynamics_tools.take(dynamics, expected, z, R * max(1.0, nis / gate) ** 2)
             trusted[k] = nis < gate
             count += 1
         steps.append(step)
-        belief = step.posterior
-    return steps, trusted
+    return steps[1:], trusted
 
 
 def _calibration(camera: GroundCamera, planar: Array) -> tuple[Array, Array]:

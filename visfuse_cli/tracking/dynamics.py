@@ -1,4 +1,4 @@
-"""How things move on the ground, in one shape for every motion model the tracker knows."""
+"""How things move on the ground, in one shape for every filter the tracker knows."""
 
 from __future__ import annotations
 
@@ -7,81 +7,97 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from visfuse_cli.maths import fading, gaussian, motion
+from visfuse_cli.maths import course, covariance_updating, fading, gaussian, imm, motion
 from visfuse_cli.maths.angles import wrap, wrap_at
+from visfuse_cli.maths.smoothing import rauch_tung_striebel
 from visfuse_cli.records import Array, Gaussian, Innovation
 from visfuse_cli.tracking.settings import FilterSettings, TargetSettings
 
 WHEELBASE_SHARE = 0.6  # of a vehicle's length
+COURSES = (course.CSD, course.CS, course.CD)  # Bradshaw 1997, sec. 4.1
+QUIET = 0.2  # of the usual noise: what a motion still has where it holds something constant
 
 
 @dataclass(frozen=True, slots=True)
 class Dynamics:
-    """A motion model ready for the tracker: states x (n,), measurements z = H x (m,) of which some are angles."""
+    """A motion, or several that interact, ready for the tracker: states x (n,), measurements z = H x (m,).
+
+    `angles_z` and `angles_x` are components on the circle. With `log_p` (r, r) the states that `advance` moves are
+    those of r models, (N, r, n).
+    """
 
     H: Array
     alpha: tuple[float, ...]  # weights of the fading factor (m,)
     angles_z: tuple[int, ...]
     angles_x: tuple[int, ...]
-    advance: Callable[[Array, Array, Array], tuple[Array, Array, Array]]  # x, dt, length (N, ...) -> x', F, Q
+    advance: Callable[[Array, Array, Array, Array], tuple[Array, Array, Array]]  # x, P, dt, length (N, ...) -> x', F, Q
     begin: Callable[[Array, Array], Gaussian]  # pose (3,), velocity (2,) -> belief
     planar: Callable[[Array], tuple[Array, Array]]  # x (..., n) -> (X, Y, X', Y') and its Jacobian (..., 4, n)
     heading: Callable[[Array], Array]  # x (..., n) -> rad (...)
     measured: Callable[[Array, Array], tuple[Array, Array]]  # pose (3,), cov (3, 3) -> z, R
-    adaptive: bool  # fading factor in use
+    fades: bool  # fading factor in use
+    log_p: Array | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class Prediction:
-    """Where N targets are expected: prior (N, n), transitions F (N, n, n) and the noise Q (N, n, n) in the prior."""
+    """Where a target is expected: prior (n,), transition F and the noise Q (n, n) in the prior; what it remembers."""
 
     prior: Gaussian
     F: Array
     Q: Array
-
-    def __getitem__(self, k: int) -> Prediction:
-        return Prediction(Gaussian(self.prior.mean[k], self.prior.cov[k]), self.F[k], self.Q[k])
+    memory: fading.FadingState | None
+    models: imm.Step | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """One filter step of one target: prior, posterior, the transition to it, and what the measurement said (if any)."""
+    """One filter step of one target: prior, posterior, the transition to it, and what the measurement said (if any).
+
+    `memory` is the fading filter's record of residuals, `models` the interacting models' own step.
+    """
 
     prior: Gaussian
     posterior: Gaussian
     F: Array
     innovation: Innovation | None
     memory: fading.FadingState | None
+    models: imm.Step | None = None
 
 
 def for_target(target: TargetSettings, filter_: FilterSettings) -> Dynamics:
-    """The dynamics that a configuration asks for: the bicycle (Lou 2002, eq. 1) or constant velocity."""
-    adaptive = filter_.kind == "fading"
-    if target.motion == "bicycle":
-        return _bicycle(filter_, adaptive)
-    return _constant_velocity(filter_, adaptive)
+    """The dynamics that a configuration asks for: things that steer (Lou 2002, eq. 1) or people, and the filter."""
+    steers = target.motion == "bicycle"
+    if filter_.kind == "imm":
+        return _interacting(filter_, steers)
+    accelerates = filter_.kind in ("cuf", "fading-cuf")
+    return (_bicycle if steers else _walk)(filter_, accelerates, filter_.kind.startswith("fading"))
 
 
-def _bicycle(filter_: FilterSettings, adaptive: bool) -> Dynamics:
-    def advance(x: Array, dt: Array, length: Array) -> tuple[Array, Array, Array]:
+def _bicycle(filter_: FilterSettings, accelerates: bool, fades: bool) -> Dynamics:
+    def advance(x: Array, cov: Array, dt: Array, length: Array) -> tuple[Array, Array, Array]:
         wheelbase = WHEELBASE_SHARE * length
+        if accelerates:
+            return covariance_updating.advance(x, cov, dt, wheelbase, filter_.sigma_steer, filter_.sigma_jerk)
         following, F = motion.bicycle(x, dt, wheelbase)
         return following, F, motion.bicycle_noise(x, dt, wheelbase, filter_.sigma_a, filter_.sigma_steer)
 
+    size = 6 if accelerates else 5
+
     def begin(pose: Array, velocity: Array) -> Gaussian:
         speed = float(velocity @ [np.cos(pose[2]), np.sin(pose[2])])  # negative: it reverses
-        mean = np.array([pose[0], pose[1], speed, pose[2], 0.0])
-        return Gaussian(mean, np.diag([0.5, 0.5, max(1.5, 0.3 * abs(speed)), 0.2, 0.1]) ** 2)
+        mean = np.array([pose[0], pose[1], speed, pose[2], 0.0, 0.0])
+        deviation = np.array([0.5, 0.5, max(1.5, 0.3 * abs(speed)), 0.2, 0.1, 1.5])
+        return Gaussian(mean[:size], np.diag(deviation[:size] ** 2))
 
     def planar(x: Array) -> tuple[Array, Array]:
-        velocity, J = motion.bicycle_velocity(x)
-        position = np.eye(2, 5)
-        return np.concatenate([x[..., :2], velocity], axis=-1), np.concatenate(
-            [np.broadcast_to(position, (*J.shape[:-2], 2, 5)), J], axis=-2
-        )
+        velocity, J_velocity = motion.bicycle_velocity(x)
+        J = np.zeros((*x.shape[:-1], 4, size))
+        J[..., :2, :2], J[..., 2:, :5] = np.eye(2), J_velocity
+        return np.concatenate([x[..., :2], velocity], axis=-1), J
 
     return Dynamics(
-        H=motion.BICYCLE_MEASUREMENT,
+        H=np.eye(size)[[0, 1, 3]],
         alpha=fading.ALPHA,
         angles_z=(2,),
         angles_x=(3,),
@@ -90,42 +106,115 @@ def _bicycle(filter_: FilterSettings, adaptive: bool) -> Dynamics:
         planar=planar,
         heading=lambda x: x[..., 3],
         measured=lambda pose, cov: (pose, cov),
-        adaptive=adaptive,
+        fades=fades,
     )
 
 
-def _constant_velocity(filter_: FilterSettings, adaptive: bool) -> Dynamics:
-    def advance(x: Array, dt: Array, length: Array) -> tuple[Array, Array, Array]:
-        F = motion.constant_velocity(dt)
-        return gaussian.times(F, x), F, motion.constant_velocity_noise(dt, filter_.sigma_a**2)
+def _walk(filter_: FilterSettings, accelerates: bool, fades: bool) -> Dynamics:
+    size = 6 if accelerates else 4
+
+    def advance(x: Array, cov: Array, dt: Array, length: Array) -> tuple[Array, Array, Array]:
+        if accelerates:
+            F, Q = motion.constant_acceleration(dt), motion.constant_acceleration_noise(dt, filter_.sigma_jerk**2)
+        else:
+            F, Q = motion.constant_velocity(dt), motion.constant_velocity_noise(dt, filter_.sigma_a**2)
+        return gaussian.times(F, x), F, Q
 
     def begin(pose: Array, velocity: Array) -> Gaussian:
-        return Gaussian(np.concatenate([pose[:2], velocity]), np.diag([0.3, 0.3, 0.8, 0.8]) ** 2)
+        mean = np.concatenate([pose[:2], velocity, [0.0, 0.0]])
+        return Gaussian(mean[:size], np.diag(np.array([0.3, 0.3, 0.8, 0.8, 0.8, 0.8])[:size] ** 2))
 
     return Dynamics(
-        H=np.eye(2, 4),
+        H=np.eye(2, size),
         alpha=(1.0, 1.0),
         angles_z=(),
         angles_x=(),
         advance=advance,
         begin=begin,
-        planar=lambda x: (x, np.broadcast_to(np.eye(4), (*x.shape[:-1], 4, 4))),
+        planar=lambda x: (x[..., :4], np.broadcast_to(np.eye(4, size), (*x.shape[:-1], 4, size))),
         heading=lambda x: np.arctan2(x[..., 3], x[..., 2]),
         measured=lambda pose, cov: (pose[:2], cov[:2, :2]),
-        adaptive=adaptive,
+        fades=fades,
     )
 
 
-def predict(dynamics: Dynamics, beliefs: Sequence[Gaussian], dt: Array, length: Array) -> Prediction:
-    """Advance N beliefs by dt (N,) s; length (N,) m is each target's own."""
-    mean, F, Q = dynamics.advance(np.stack([belief.mean for belief in beliefs]), dt, length)
-    cov = gaussian.propagate(np.stack([belief.cov for belief in beliefs]), F, Q)
-    return Prediction(Gaussian(mean, cov), F, Q)
+def _interacting(filter_: FilterSettings, heading_seen: bool) -> Dynamics:
+    spare = (filter_.sigma_a**2, filter_.sigma_turn**2)
+    steady, straight = (QUIET * filter_.sigma_a) ** 2, (QUIET * filter_.sigma_steer) ** 2
+    densities = (  # of what each motion changes in speed and in course
+        (steady, straight),
+        (steady, filter_.sigma_turn**2),
+        (filter_.sigma_jerk**2, straight),
+    )
+
+    def advance(x: Array, cov: Array, dt: Array, length: Array) -> tuple[Array, Array, Array]:
+        moved, F, Q = [], [], []
+        for k, (kind, (speed, turn)) in enumerate(zip(COURSES, densities, strict=True)):
+            mean, way = course.advance(x[..., k, :], dt, kind)
+            moved.append(mean)
+            F.append(way)
+            Q.append(course.noise(x[..., k, :], dt, kind, speed, turn, spare))
+        return np.stack(moved, axis=-2), np.stack(F, axis=-3), np.stack(Q, axis=-3)
+
+    def begin(pose: Array, velocity: Array) -> Gaussian:
+        theta = pose[2] if heading_seen else np.arctan2(velocity[1], velocity[0])
+        speed = float(velocity @ [np.cos(theta), np.sin(theta)])
+        mean = np.array([pose[0], pose[1], speed, theta, 0.0, 0.0])
+        deviation = np.array([0.5, 0.5, max(1.0, 0.3 * abs(speed)), 0.2 if heading_seen else 0.5, *np.sqrt(spare)])
+        return Gaussian(mean, np.diag(deviation**2))
+
+    rows = [0, 1, 3] if heading_seen else [0, 1]
+    return Dynamics(
+        H=np.eye(6)[rows],
+        alpha=(1.0,) * len(rows),
+        angles_z=(2,) if heading_seen else (),
+        angles_x=course.ANGLES,
+        advance=advance,
+        begin=begin,
+        planar=course.observe,
+        heading=lambda x: x[..., 3],
+        measured=lambda pose, cov: (pose[: len(rows)], cov[: len(rows), : len(rows)]),
+        fades=False,
+        log_p=imm.transition(len(COURSES), filter_.stay),
+    )
 
 
-def coast(prediction: Prediction, memory: fading.FadingState | None) -> Step:
+def first(dynamics: Dynamics, belief: Gaussian) -> Step:
+    """The step a track begins with, before anything is predicted."""
+    eye = np.eye(len(belief.mean))
+    models = None
+    if dynamics.log_p is not None:
+        bank = imm.start(belief, len(dynamics.log_p))
+        ways = np.broadcast_to(eye, bank.beliefs.cov.shape)
+        models = imm.Step(bank.beliefs, ways, 0 * ways, bank.beliefs, bank.log_mu, bank)
+    return Step(belief, belief, eye, None, None, models)
+
+
+def predict(dynamics: Dynamics, steps: Sequence[Step], dt: Array, length: Array) -> list[Prediction]:
+    """Advance N targets from their latest steps by dt (N,) s; length (N,) m is each target's own."""
+    if dynamics.log_p is not None:
+        return _predict_models(dynamics, steps, dt, length)
+    before = _stacked([step.posterior for step in steps])
+    mean, F, Q = dynamics.advance(before.mean, before.cov, dt, length)
+    cov = gaussian.propagate(before.cov, F, Q)
+    return [Prediction(Gaussian(mean[k], cov[k]), F[k], Q[k], step.memory) for k, step in enumerate(steps)]
+
+
+def _predict_models(dynamics: Dynamics, steps: Sequence[Step], dt: Array, length: Array) -> list[Prediction]:
+    assert dynamics.log_p is not None
+    banks = [step.models.filtered for step in steps if step.models is not None]
+    bank = imm.Bank(_stacked([each.beliefs for each in banks]), np.stack([each.log_mu for each in banks]))
+    ahead = imm.predict(bank, dynamics.log_p, lambda x: dynamics.advance(x, x, dt, length), dynamics.angles_x)
+    prior = imm.combined(ahead.filtered, dynamics.angles_x)
+    return [
+        Prediction(Gaussian(prior.mean[k], prior.cov[k]), ahead.F[k, 0], ahead.Q[k, 0], None, imm.at(ahead, k))
+        for k in range(len(steps))
+    ]
+
+
+def coast(prediction: Prediction) -> Step:
     """The step of a target that was not measured."""
-    return Step(prediction.prior, prediction.prior, prediction.F, None, memory)
+    return Step(prediction.prior, prediction.prior, prediction.F, None, prediction.memory, prediction.models)
 
 
 def residual(dynamics: Dynamics, z: Array, x: Array) -> Array:
@@ -136,12 +225,30 @@ def residual(dynamics: Dynamics, z: Array, x: Array) -> Array:
     return difference
 
 
-def take(dynamics: Dynamics, prediction: Prediction, z: Array, R: Array, memory: fading.FadingState | None) -> Step:
-    """Take in one target's measurement (Lou 2002, eqs. 5-11); `memory` is the fading filter's record of residuals."""
+def take(dynamics: Dynamics, prediction: Prediction, z: Array, R: Array) -> Step:
+    """Take in one target's measurement (Lou 2002, eqs. 5-11; Jia 2008, eqs. 27-31 where models interact)."""
     gamma = residual(dynamics, z, prediction.prior.mean)
-    if memory is None:
-        memory = fading.start(prediction.prior, dynamics.H, R)
-    limit = fading.LIMIT if dynamics.adaptive else 1.0
+    if prediction.models is not None:
+        each = residual(dynamics, z, prediction.models.predicted.mean)
+        models, _ = imm.update(prediction.models, each, dynamics.H, R)
+        innovation, _ = gaussian.innovate(prediction.prior, gamma, dynamics.H, R)
+        posterior = imm.combined(models.filtered, dynamics.angles_x)
+        return Step(prediction.prior, posterior, prediction.F, innovation, None, models)
+    memory = prediction.memory or fading.start(prediction.prior, dynamics.H, R)
+    limit = fading.LIMIT if dynamics.fades else 1.0
     taken = fading.update(prediction.prior, prediction.Q, gamma, dynamics.H, R, memory, dynamics.alpha, limit=limit)
     posterior = Gaussian(wrap_at(taken.posterior.mean, dynamics.angles_x), taken.posterior.cov)
     return Step(taken.prior, posterior, prediction.F, taken.innovation, taken.state)
+
+
+def smooth(dynamics: Dynamics, steps: Sequence[Step]) -> Gaussian:
+    """The states (T, n) of a finished track given all of it."""
+    if dynamics.log_p is not None:
+        banks = imm.smooth([step.models for step in steps if step.models], dynamics.log_p, dynamics.angles_x)
+        return _stacked([imm.combined(bank, dynamics.angles_x) for bank in banks])
+    filtered, predicted = _stacked([s.posterior for s in steps]), _stacked([s.prior for s in steps])
+    return rauch_tung_striebel(filtered, predicted, np.stack([s.F for s in steps]), dynamics.angles_x)
+
+
+def _stacked(beliefs: Sequence[Gaussian]) -> Gaussian:
+    return Gaussian(np.stack([belief.mean for belief in beliefs]), np.stack([belief.cov for belief in beliefs]))

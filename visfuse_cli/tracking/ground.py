@@ -61,13 +61,12 @@ class GroundTracker:
         self._t = t
         self._expected = []
         if self.tracks:
-            prediction = dynamics_tools.predict(
+            self._expected = dynamics_tools.predict(
                 self.dynamics,
-                [track.steps[-1].posterior for track in self.tracks],
+                [track.steps[-1] for track in self.tracks],
                 np.array([t - track.samples[-1].t for track in self.tracks]),
                 np.array([track.size[0] for track in self.tracks]),
             )
-            self._expected = [prediction[k] for k in range(len(self.tracks))]
 
     def update(self, frame: int, evidence: Evidence) -> tuple[list[Track], list[Abandoned]]:
         """Measure every track, and let the rest become tracks; returns the tracks and candidates that ended."""
@@ -129,7 +128,7 @@ class GroundTracker:
         there = fit.ok & measure.looks_right(fit, look.outlines) & (look.moved > SEEN_SHARE) & ~(border < SEEN_SHARE)
         there &= look.open > LEAST_OPEN
         for k, track in enumerate(self.tracks):
-            step = dynamics_tools.coast(self._expected[k], track.steps[-1].memory)
+            step = dynamics_tools.coast(self._expected[k])
             if np.isfinite(border[k]):
                 elapsed = self._t - track.samples[-1].t
                 share = min(1.0, elapsed / LIKENESS_S)
@@ -138,7 +137,7 @@ class GroundTracker:
             sample = Sample(frame, self._t, look.outlines[k], float(border[k]), False)
             if there[k]:
                 z, R = self.dynamics.measured(*measure.measurement(fit, k, pose[k]))
-                tried = dynamics_tools.take(self.dynamics, self._expected[k], z, R, step.memory)
+                tried = dynamics_tools.take(self.dynamics, self._expected[k], z, R)
                 if self._plausible(track, tried, z, R):
                     step, sample.measured = tried, True
                     track.last_measured, track.refused_since = sample.t, None

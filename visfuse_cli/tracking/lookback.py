@@ -41,13 +41,13 @@ def trace(
     Time runs backwards: to the motion model it is the same thing driving away the other way round.
     """
     turned = np.array([guess.pose[0], guess.pose[1], guess.pose[2] + np.pi])
-    belief, memory = dynamics.begin(turned, -velocity), None
+    step = dynamics_tools.first(dynamics, dynamics.begin(turned, -velocity))
     gate = gate_size(len(dynamics.H), settings.pose.gate)
     before = last_seen = recent[-1][1]
     samples: list[Sample] = []
     poses: list[Array] = []
     for frame, t, evidence in reversed(recent):
-        expected = dynamics_tools.predict(dynamics, [belief], np.array([before - t]), guess.size[:1])[0]
+        expected = dynamics_tools.predict(dynamics, [step], np.array([before - t]), guess.size[:1])[0]
         mean = expected.prior.mean
         pose = np.array([[mean[0], mean[1], dynamics.heading(mean) - np.pi]])
         size = guess.size[None]
@@ -60,7 +60,7 @@ def trace(
         spread = np.sqrt(np.trace(J[0, :, :2] @ expected.prior.cov[:2, :2] @ J[0, :, :2].T))
         look = evidence.probe(pose, size, np.clip(3 * spread, *REACH_PX)[None], taken_at(frame))
         fit = measure.fit_poses(camera, look.outlines, pose, size, guess.size_sigma, settings.pose)
-        step = dynamics_tools.coast(expected, memory)
+        step = dynamics_tools.coast(expected)
         seen = bool(
             fit.ok[0]
             & measure.looks_right(fit, look.outlines)[0]
@@ -73,12 +73,12 @@ def trace(
             gamma = dynamics_tools.residual(dynamics, z, mean)
             seen = bool(mahalanobis(gamma, dynamics.H @ expected.prior.cov @ dynamics.H.T + R) < gate)
             if seen:
-                step = dynamics_tools.take(dynamics, expected, z, R, memory)
-                last_seen, memory = t, step.memory
+                step = dynamics_tools.take(dynamics, expected, z, R)
+                last_seen = t
         samples.append(Sample(frame, t, look.outlines[0], float(look.border[0] * fit.agreed[0]), seen))
         after = step.posterior.mean
         poses.append(np.array([after[0], after[1], dynamics.heading(after) - np.pi]))
-        belief, before = step.posterior, t
+        before = t
     while samples and not samples[-1].measured:
         samples.pop()
         poses.pop()
