@@ -33,7 +33,7 @@ WARM_UP_S = 1.0
 LEAST_S, LEAST_M = 3.0, 3.0  # shorter tracks, and what stands, are left out
 HEADING_SIGMA = np.deg2rad(2.0)
 LENGTH = {"cars": 4.2, "cart": 2.4, "people": 0.5}
-PLAIN_Q = {"cars": 4.0, "cart": 0.5, "people": 0.5}  # m^2 s^-3 of the plain filter, the best on the tuning files
+PLAIN_Q = {"cars": 0.5, "cart": 0.25, "people": 0.1}  # m^2 s^-3 of the plain filter, the best on the tuning files
 
 
 @dataclass(frozen=True)

@@ -18,18 +18,18 @@ from visfuse_cli.records import Array
 DRIVEN = [4, 5]  # steering angle and acceleration
 
 
-def steered(x: Array, dt: ArrayLike, wheelbase: ArrayLike) -> tuple[Array, Array]:
+def steered(x: Array, dt: ArrayLike, wheelbase: ArrayLike, straighten: float = 0.0) -> tuple[Array, Array]:
     """The car (..., 6) after dt (...) s, acceleration and steering constant, and the Jacobian (..., 6, 6).
 
     State [x, y, v, theta, phi, a]: the bicycle's (Lou 2002, eq. 1) and the acceleration (m/s^2). Exact: the way along
-    the arc is that of the mean speed.
+    the arc is that of the mean speed. `straighten` (1/s) as in the bicycle.
     """
     dt = np.asarray(dt, dtype=float)
     shape = np.broadcast_shapes(x.shape[:-1], dt.shape)
     dt, x = np.broadcast_to(dt, shape), np.broadcast_to(x, (*shape, 6)).copy()
     gain = x[..., 5] * dt / 2
     x[..., 2] += gain  # the mean speed
-    moved, by_state = bicycle(x[..., :5], dt, wheelbase)
+    moved, by_state = bicycle(x[..., :5], dt, wheelbase, straighten)
     moved[..., 2] += gain
     F = np.zeros((*shape, 6, 6))
     F[..., :5, :5] = by_state
@@ -39,30 +39,39 @@ def steered(x: Array, dt: ArrayLike, wheelbase: ArrayLike) -> tuple[Array, Array
     return np.concatenate([moved, x[..., 5:]], axis=-1), F
 
 
-def noise(x: Array, dt: ArrayLike, wheelbase: ArrayLike, sigma_steer: float, sigma_jerk: float) -> Array:
+def noise(
+    x: Array, dt: ArrayLike, wheelbase: ArrayLike, sigma_steer: float, sigma_jerk: float, straighten: float = 0.0
+) -> Array:
     """Q (..., 6, 6) over dt (...) s of Brownian steering (rad/s per root Hz) and acceleration (m/s^3 per root Hz)."""
     dt = np.broadcast_to(np.asarray(dt, dtype=float), x.shape[:-1])
     struck = dt * _fractions(dt)  # when the noise strikes, points first: (3, ...)
-    to_end = steered(steered(x, struck, wheelbase)[0], dt - struck, wheelbase)[1][..., DRIVEN]
+    there = steered(x, struck, wheelbase, straighten)[0]
+    to_end = steered(there, dt - struck, wheelbase, straighten)[1][..., DRIVEN]
     rates = (to_end * np.array([sigma_steer, sigma_jerk]) ** 2) @ transpose(to_end)
     return symmetrise(np.tensordot(WEIGHTS / 2, rates, axes=1) * dt[..., None, None])
 
 
 def advance(
-    x: Array, cov: Array, dt: ArrayLike, wheelbase: ArrayLike, sigma_steer: float, sigma_jerk: float
+    x: Array,
+    cov: Array,
+    dt: ArrayLike,
+    wheelbase: ArrayLike,
+    sigma_steer: float,
+    sigma_jerk: float,
+    straighten: float = 0.0,
 ) -> tuple[Array, Array, Array]:
     """Mean (..., 6) dt (...) s later, the Jacobian F and the noise Q (..., 6, 6), so that P' = F P F^T + Q.
 
     The mean follows d E[x]/dt = f(E[x]) + f'':P / 2, with P as it grows along the way. Lou 2002, sec. 1.
     """
     dt = np.broadcast_to(np.asarray(dt, dtype=float), x.shape[:-1])
-    mean, F = steered(x, dt, wheelbase)
-    Q = noise(x, dt, wheelbase, sigma_steer, sigma_jerk)
+    mean, F = steered(x, dt, wheelbase, straighten)
+    Q = noise(x, dt, wheelbase, sigma_steer, sigma_jerk, straighten)
     at = dt * _fractions(dt)
-    there, to_there = steered(x, at, wheelbase)
-    own = noise(np.broadcast_to(x, there.shape), at, wheelbase, sigma_steer, sigma_jerk)
+    there, to_there = steered(x, at, wheelbase, straighten)
+    own = noise(np.broadcast_to(x, there.shape), at, wheelbase, sigma_steer, sigma_jerk, straighten)
     spread = to_there @ cov @ transpose(to_there) + own
-    to_end = steered(there, dt - at, wheelbase)[1]
+    to_end = steered(there, dt - at, wheelbase, straighten)[1]
     drift = times(to_end, _curvature(there, spread, wheelbase))
     mean = mean + np.tensordot(WEIGHTS / 2, drift, axes=1) * dt[..., None]
     mean[..., 3] = wrap(mean[..., 3])

@@ -10,10 +10,12 @@ from numpy.typing import NDArray
 from visfuse_cli.maths.angles import wrap_at
 from visfuse_cli.records import Array, Gaussian, Innovation
 
+HALF_LOG_TAU = 0.5 * np.log(2 * np.pi)
+
 
 def transpose(matrix: NDArray[Any]) -> Array:
     """Matrices (..., n, m) transposed to (..., m, n)."""
-    return np.swapaxes(matrix, -1, -2)
+    return matrix.swapaxes(-1, -2)
 
 
 def symmetrise(cov: Array) -> Array:
@@ -52,11 +54,14 @@ def innovate(belief: Gaussian, residual: Array, H: Array, R: Array) -> tuple[Inn
     """
     H_P = H @ belief.cov
     S = symmetrise(H_P @ transpose(H) + R)
-    solved = np.linalg.solve(S, np.concatenate([H_P, np.broadcast_to(residual, H_P.shape[:-1])[..., None]], axis=-1))
+    if residual.shape != H_P.shape[:-1]:
+        shape = np.broadcast_shapes(residual.shape, H_P.shape[:-1])
+        residual, H_P = np.broadcast_to(residual, shape), np.broadcast_to(H_P, (*shape, H_P.shape[-1]))
+    solved = np.linalg.solve(S, np.concatenate([H_P, residual[..., None]], axis=-1))
     gain = transpose(solved[..., :-1])
-    nis = np.sum(residual * solved[..., -1], axis=-1)
+    nis = (residual * solved[..., -1]).sum(axis=-1)
     log_likelihood = -0.5 * nis - _log_normaliser(np.linalg.cholesky(S))
-    return Innovation(np.broadcast_to(residual, nis.shape + S.shape[-1:]), S, nis, log_likelihood), gain
+    return Innovation(residual, S, nis, log_likelihood), gain
 
 
 def update(belief: Gaussian, residual: Array, H: Array, R: Array) -> tuple[Gaussian, Innovation]:
@@ -100,7 +105,7 @@ def _density(residual: Array, cov: Array) -> tuple[Array, Array]:
 
 def _log_normaliser(L: NDArray[Any]) -> Array:
     """log of sqrt(det(2 pi S)) (...) from the Cholesky factors (..., n, n) of S."""
-    return np.sum(np.log(np.diagonal(L, axis1=-2, axis2=-1)), axis=-1) + 0.5 * L.shape[-1] * np.log(2 * np.pi)
+    return np.log(L.diagonal(axis1=-2, axis2=-1)).sum(axis=-1) + L.shape[-1] * HALF_LOG_TAU
 
 
 def moment_match(means: Array, covs: Array, log_weights: Array, angles: tuple[int, ...] = ()) -> Gaussian:

@@ -9,7 +9,7 @@ is batched over leading axes.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -18,6 +18,7 @@ from visfuse_cli.maths.angles import wrap_at
 from visfuse_cli.maths.gaussian import symmetrise, times, transpose
 from visfuse_cli.records import Array, Gaussian, Innovation
 
+LEAST_LEFT, LEAST_KNOWN = 1e-12, 1e-9  # shares of a variance: rounding, below
 Advance = Callable[[Array], tuple[Array, Array, Array]]  # x (..., r, N) -> x', F, Q, each model by its own motion
 
 
@@ -111,7 +112,7 @@ def predict(bank: Bank, log_p: Array, advance: Advance, angles: tuple[int, ...] 
     mixed, ahead = mix(bank, log_p, angles)
     mean, F, Q = advance(mixed.mean)
     predicted = Gaussian(mean, gaussian.propagate(mixed.cov, F, Q))
-    F, Q = (np.broadcast_to(part, mixed.cov.shape) for part in (F, Q))
+    F, Q = (part if part.shape == mixed.cov.shape else np.broadcast_to(part, mixed.cov.shape) for part in (F, Q))
     return Step(mixed, F, Q, predicted, ahead, Bank(predicted, ahead))
 
 
@@ -122,7 +123,8 @@ def update(step: Step, residual: Array, H: Array, R: Array) -> tuple[Step, Innov
     Raises LinAlgError where H P H^T + R is not positive definite.
     """
     beliefs, innovation = gaussian.update(step.predicted, residual, H, R)
-    return replace(step, filtered=Bank(beliefs, weigh(step.ahead, innovation.log_likelihood))), innovation
+    after = Bank(beliefs, weigh(step.ahead, innovation.log_likelihood))
+    return Step(step.mixed, step.F, step.Q, step.predicted, step.ahead, after), innovation
 
 
 def weigh(ahead: Array, log_likelihood: Array) -> Array:
@@ -140,9 +142,9 @@ def combined(bank: Bank, angles: tuple[int, ...] = ()) -> Gaussian:
 def smooth(steps: Sequence[Step], log_p: Array, angles: tuple[int, ...] = ()) -> list[Bank]:
     """Every instant's bank given the whole recording: a fixed-interval smoother over pairs of models.
 
-    Each model of now is smoothed by each model of the next instant, and the pairs are weighed by how likely the one
-    followed the other (Kim 1994, Dynamic linear models with Markov switching). With one model this is the
-    Rauch-Tung-Striebel pass. Raises LinAlgError where a predicted covariance is singular.
+    What the future says of the state, if model i comes next, is the step back from model i's smoothed state, less what
+    it began with; each model j of now takes it in as a measurement, and the pairs are weighed by how well j fits it.
+    With one model this is the Rauch-Tung-Striebel pass. Raises LinAlgError where a covariance is singular.
     """
     banks = [steps[-1].filtered]
     for now, after in zip(steps[-2::-1], steps[:0:-1], strict=True):
@@ -152,24 +154,42 @@ def smooth(steps: Sequence[Step], log_p: Array, angles: tuple[int, ...] = ()) ->
 
 def _smoothed(now: Bank, after: Step, later: Bank, log_p: Array, angles: tuple[int, ...]) -> Bank:
     """The bank now, given the smoothed bank one step later."""
-    joint = log_p + now.log_mu[..., :, None] - after.ahead[..., None, :] + later.log_mu[..., None, :]  # (..., j, i)
-    log_mu = _log_sum(joint, axis=-1)
-    share = np.exp(joint - log_mu[..., None])
-    P, F, Q = now.beliefs.cov[..., :, None, :, :], after.F[..., None, :, :, :], after.Q[..., None, :, :, :]
+    H, value = _of_the_future(after, later, angles)
+    P = now.beliefs.cov[..., :, None, :, :]  # of model j now, before model i: (..., j, i, n, n)
     off = wrap_at(now.beliefs.mean[..., :, None, :] - after.mixed.mean[..., None, :, :], angles)
-    expected = times(F, off) + after.predicted.mean[..., None, :, :]
-    F_P = F @ P
-    gain = transpose(np.linalg.solve(symmetrise(F_P @ transpose(F) + Q), F_P))
-    surprise = wrap_at(later.beliefs.mean[..., None, :, :] - expected, angles)
-    moved = times(gain, surprise)  # of model j now, by model i next: (..., j, i, N)
-    keep = np.eye(P.shape[-1]) - gain @ F
-    cov = keep @ P @ transpose(keep) + gain @ (Q + later.beliefs.cov[..., None, :, :, :]) @ transpose(gain)
-    shift = np.sum(share[..., None] * moved, axis=-2)
-    spread = moved - shift[..., :, None, :]
-    matched = np.sum(share[..., None, None] * (cov + spread[..., :, None] * spread[..., None, :]), axis=-3)
-    return Bank(Gaussian(wrap_at(now.beliefs.mean + shift, angles), symmetrise(matched)), log_mu)
+    H_ji = np.broadcast_to(H[..., None, :, :, :], (*off.shape, off.shape[-1]))
+    residual = value[..., None, :, :] - times(H_ji, off)
+    moved, said = gaussian.update(Gaussian(0 * off, P), residual, H_ji, np.eye(off.shape[-1]))
+    share = log_p + now.log_mu[..., :, None] + said.log_likelihood
+    share = share - _log_sum(share, axis=-2)[..., None, :]  # of j, given i next and all that was seen
+    joint = share + later.log_mu[..., None, :]
+    log_mu = _log_sum(joint, axis=-1)
+    one = _matched(moved, np.exp(joint - log_mu[..., None])[..., None, :], ())
+    mean, cov = one.mean[..., 0, :], one.cov[..., 0, :, :]
+    return Bank(Gaussian(wrap_at(now.beliefs.mean + mean, angles), symmetrise(cov)), log_mu)
+
+
+def _of_the_future(after: Step, later: Bank, angles: tuple[int, ...]) -> tuple[Array, Array]:
+    """What all that comes says of the state now, if model i is next: a measurement H (..., i, n, n) of unit noise.
+
+    Its value (..., i, n) is of the state less model i's mixed one. Where the future says nothing, H has rows of zeros.
+    """
+    M, F = after.mixed.cov, after.F
+    F_M = F @ M
+    gain = transpose(np.linalg.solve(after.predicted.cov, F_M))
+    shift = times(gain, wrap_at(later.beliefs.mean - after.predicted.mean, angles))
+    keep = np.eye(M.shape[-1]) - gain @ F
+    S = symmetrise(keep @ M @ transpose(keep) + gain @ (after.Q + later.beliefs.cov) @ transpose(gain))
+    L = np.linalg.cholesky(M)
+    L_S = np.linalg.solve(L, S)
+    left, V = np.linalg.eigh(symmetrise(np.linalg.solve(L, transpose(L_S))))  # doubt left, as a share of what there was
+    known = np.clip(1 / np.maximum(left, LEAST_LEFT) - 1, 0, None)
+    root = np.sqrt(np.where(known > LEAST_KNOWN, known, 0.0))
+    V_T = transpose(V)
+    whitened = times(V_T, np.linalg.solve(L, shift[..., None])[..., 0])
+    value = np.divide(whitened * (1 + known), root, out=np.zeros_like(root), where=root > 0)
+    return root[..., None] * V_T @ np.linalg.inv(L), value
 
 
 def _log_sum(values: Array, axis: int) -> Array:
-    top = np.max(values, axis=axis, keepdims=True)
-    return np.asarray(np.squeeze(top, axis) + np.log(np.sum(np.exp(values - top), axis=axis)))
+    return np.asarray(np.logaddexp.reduce(values, axis=axis))

@@ -102,16 +102,19 @@ def _each_axis(block: list[list[Array]], dims: int) -> Array:
     return np.einsum("...ij,kl->...ikjl", matrix, np.eye(dims)).reshape(*matrix.shape[:-2], size, size)
 
 
-def bicycle(x: Array, dt: ArrayLike, wheelbase: ArrayLike) -> tuple[Array, Array]:
+def bicycle(x: Array, dt: ArrayLike, wheelbase: ArrayLike, straighten: float = 0.0) -> tuple[Array, Array]:
     """The car (..., 5) after dt (...) s with v and phi constant, and the Jacobian (..., 5, 5). Lou 2002, eq. 1.
 
     State [x, y, v, theta, phi]: the centre between the axles (m), the rear wheel's speed (m/s, negative in reverse),
     heading and steering angle (rad); wheelbase (...) m. phi is cut at STEERING_LIMIT, where the Jacobian is the inner
-    side's, so that a filter at the limit can still turn back. Exact: the rear axle runs along a circle.
+    side's, so that a filter at the limit can still turn back. Exact: the rear axle runs along a circle. Where drivers
+    `straighten` up (1/s), phi goes back to zero at that rate and the circle is that of its mean over the step.
     """
     v, theta, phi = x[..., 2], x[..., 3], np.clip(x[..., 4], -STEERING_LIMIT, STEERING_LIMIT)
     dt, wheelbase = np.asarray(dt, dtype=float), np.asarray(wheelbase, dtype=float)
-    tau = np.tan(phi)
+    decay = straighten * dt
+    on_average = np.where(decay > 1e-6, -np.expm1(-decay) / np.maximum(decay, 1e-6), 1 - decay / 2)
+    tau = np.tan(phi * on_average)
     way, turn = v * dt, v * dt * tau / wheelbase
     chord, chord_slope = sinc(turn / 2)
     along, across = axes(theta + turn / 2)
@@ -127,26 +130,35 @@ def bicycle(x: Array, dt: ArrayLike, wheelbase: ArrayLike) -> tuple[Array, Array
     F[..., :2, 2] = (dt * chord)[..., None] * course + by_turn * (dt * tau / wheelbase)[..., None]
     F[..., :2, 3] = (way * chord)[..., None] * course_turned
     by_steering = (way * chord / 2)[..., None] * across + by_turn * (way / wheelbase)[..., None]
-    F[..., :2, 4] = tau_slope[..., None] * by_steering
+    F[..., :2, 4] = (tau_slope * on_average)[..., None] * by_steering
     F[..., 3, 2] = dt * tau / wheelbase
-    F[..., 3, 4] = way * tau_slope / wheelbase
+    F[..., 3, 4] = way * tau_slope * on_average / wheelbase
+    F[..., 4, 4] = np.exp(-decay)
     x_next = np.empty(F.shape[:-1])
     x_next[..., :2] = x[..., :2] + moved
-    x_next[..., 2], x_next[..., 3], x_next[..., 4] = v, wrap(theta + turn), phi
+    x_next[..., 2], x_next[..., 3], x_next[..., 4] = v, wrap(theta + turn), phi * F[..., 4, 4]
     return x_next, F
 
 
-def bicycle_noise(x: Array, dt: ArrayLike, wheelbase: ArrayLike, sigma_a: ArrayLike, sigma_steer: ArrayLike) -> Array:
+def bicycle_noise(
+    x: Array,
+    dt: ArrayLike,
+    wheelbase: ArrayLike,
+    sigma_a: ArrayLike,
+    sigma_steer: ArrayLike,
+    straighten: float = 0.0,
+) -> Array:
     """Q (..., 5, 5) over dt (...) s from white acceleration and white steering rate, carried through the motion.
 
     x (..., 5) is the state at the start; sigma_a (m/s^2 per root Hz) and sigma_steer (rad/s per root Hz) are the
-    square roots of the spectral densities of a and b in Lou 2002, eq. 1.
+    square roots of the spectral densities of a and b in Lou 2002, eq. 1; `straighten` as in `bicycle`.
     """
     x, dt = np.asarray(x, dtype=float), np.asarray(dt, dtype=float)
     density = np.stack(np.broadcast_arrays(np.asarray(sigma_a) ** 2.0, np.asarray(sigma_steer) ** 2.0), axis=-1)
     dt = np.broadcast_to(dt, np.broadcast_shapes(x.shape[:-1], dt.shape))
     struck = dt * ((1 + NODES) / 2).reshape(3, *[1] * dt.ndim)  # when the noise strikes, points first: (3, ...)
-    to_end = bicycle(bicycle(x, struck, wheelbase)[0], dt - struck, wheelbase)[1][..., [2, 4]]
+    there = bicycle(x, struck, wheelbase, straighten)[0]
+    to_end = bicycle(there, dt - struck, wheelbase, straighten)[1][..., [2, 4]]
     rates = (to_end * density[..., None, :]) @ transpose(to_end)
     return symmetrise(np.tensordot(WEIGHTS / 2, rates, axes=1) * dt[..., None, None])
 

@@ -75,12 +75,14 @@ def for_target(target: TargetSettings, filter_: FilterSettings) -> Dynamics:
 
 
 def _bicycle(filter_: FilterSettings, accelerates: bool, fades: bool) -> Dynamics:
+    steer, straighten = filter_.sigma_steer, filter_.straighten
+
     def advance(x: Array, cov: Array, dt: Array, length: Array) -> tuple[Array, Array, Array]:
         wheelbase = WHEELBASE_SHARE * length
         if accelerates:
-            return covariance_updating.advance(x, cov, dt, wheelbase, filter_.sigma_steer, filter_.sigma_jerk)
-        following, F = motion.bicycle(x, dt, wheelbase)
-        return following, F, motion.bicycle_noise(x, dt, wheelbase, filter_.sigma_a, filter_.sigma_steer)
+            return covariance_updating.advance(x, cov, dt, wheelbase, steer, filter_.sigma_jerk, straighten)
+        following, F = motion.bicycle(x, dt, wheelbase, straighten)
+        return following, F, motion.bicycle_noise(x, dt, wheelbase, filter_.sigma_a, steer, straighten)
 
     size = 6 if accelerates else 5
 

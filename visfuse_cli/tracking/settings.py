@@ -71,15 +71,18 @@ class FilterSettings(Section):
         description="ekf: extended Kalman filter; fading: the same with a fading factor, prompt in manoeuvres; "
         "cuf: with the acceleration in the state; fading-cuf: both; imm: three motions by speed and course",
     )
-    sigma_a: float = Field(1.5, gt=0, le=50, description="m/s^2 per root Hz: how hard the target accelerates")
-    sigma_steer: float = Field(0.15, gt=0, le=5, description="rad/s per root Hz: how fast the steering angle changes")
+    sigma_a: float = Field(0.8, gt=0, le=50, description="m/s^2 per root Hz: how hard the target accelerates")
+    sigma_steer: float = Field(0.1, gt=0, le=5, description="rad/s per root Hz: how fast the steering angle changes")
+    straighten: float = Field(
+        2.0, ge=0, le=100, description="1/s: how fast drivers let the steering go back to straight; 0: never"
+    )
     sigma_jerk: float = Field(
-        2.0, gt=0, le=100, description="m/s^3 per root Hz: how fast the acceleration changes (cuf, imm)"
+        0.7, gt=0, le=100, description="m/s^3 per root Hz: how fast the acceleration changes (cuf, imm)"
     )
     sigma_turn: float = Field(
-        0.5, gt=0, le=20, description="rad/s^2 per root Hz: how fast the rate of turn changes (imm)"
+        0.2, gt=0, le=20, description="rad/s^2 per root Hz: how fast the rate of turn changes (imm)"
     )
-    stay: float = Field(0.98, gt=0.5, lt=1, description="probability that a motion goes on over one frame (imm)")
+    stay: float = Field(0.97, gt=0.5, lt=1, description="probability that a motion goes on over one frame (imm)")
     adapt_noise: bool = Field(
         True, description="scale the measurement noise by what the innovations of the whole track say"
     )
