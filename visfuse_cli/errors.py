@@ -1,4 +1,4 @@
-"""The one family of expected failures, each with its exit code; `cli` is the only place that catches it.
+"""The one family of expected failures, each with its exit code; `cli.entry` is the only place that catches it.
 
 A message says what is wrong, where (file, line, column or key), and what would be right, in one line.
 """
