@@ -1,6 +1,7 @@
 """The traffic log: each recording once and whole, whoever writes; and what the summary makes of it."""
 
 import csv
+import hashlib
 import json
 import os
 import shutil
@@ -8,6 +9,7 @@ import sqlite3
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
+from datetime import UTC, datetime
 from importlib import resources
 from pathlib import Path
 
@@ -15,9 +17,9 @@ import numpy as np
 import pytest
 
 from visfuse_cli.apps.summary import as_text, summarise
-from visfuse_cli.errors import InputError, OutputError
-from visfuse_cli.files.traffic_log import APPLICATION, LoggedClip, TrafficLog, read
-from visfuse_cli.files.wall_clock import began
+from visfuse_cli.errors import InputError, OutputError, UsageError
+from visfuse_cli.files.traffic_log import APPLICATION, MIGRATIONS, VERSION, LoggedClip, TrafficLog, read
+from visfuse_cli.files.wall_clock import began, check_pattern
 from visfuse_cli.maths.percentiles import pace, percentile
 
 SAMPLE = Path(str(resources.files("visfuse_cli.apps.sample")))
@@ -111,13 +113,47 @@ def _versioned(path, version):
 
 
 def test_names_and_zones_tell_the_time():
-    moment = began(Path("cam1_20260701-101500.mp4"), "cam1_%Y%m%d-%H%M%S", "Europe/Vienna", None)
+    moment, _ = began(Path("cam1_20260701-101500.mp4"), "cam1_%Y%m%d-%H%M%S", "Europe/Vienna", None)
     assert moment.isoformat() == "2026-07-01T08:15:00+00:00"
-    moment = began(Path("2026-07-01T10.15.00+0530.mkv"), "%Y-%m-%dT%H.%M.%S%z", "Europe/Vienna", None)
+    moment, _ = began(Path("2026-07-01T10.15.00+0530.mkv"), "%Y-%m-%dT%H.%M.%S%z", "Europe/Vienna", None)
     assert moment.isoformat() == "2026-07-01T04:45:00+00:00"
-    assert began(Path("a.mp4"), None, "UTC", moment) is moment
+    assert began(Path("a.mp4"), None, "UTC", moment) == (moment, "")
     with pytest.raises(InputError, match=r"the name 'a' does not fit clock\.pattern"):
-        began(Path("a.mp4"), "%Y", "UTC", None)
+        began(Path("a.mp4"), "%Y%m%d%H", "UTC", None)
+    with pytest.raises(InputError, match="does not fit"):
+        began(Path("00010101-00.mp4"), "%Y%m%d-%H", "Europe/Vienna", None)  # before year 1 in UTC
+
+
+CHANGES = {  # name in Vienna, the container's time -> UTC, what is doubtful
+    "before": ("20261025-013000", None, "2026-10-24T23:30:00", ""),
+    "twice": ("20261025-023000", None, "2026-10-25T00:30:00", "was twice"),
+    "twice, the container knows": ("20261025-023000", "2026-10-25T01:31:00", "2026-10-25T01:30:00", ""),
+    "twice, the container is elsewhere": ("20261025-023000", "2026-10-25T05:00:00", "2026-10-25T00:30:00", "was twice"),
+    "after": ("20261025-033000", None, "2026-10-25T02:30:00", ""),
+    "never": ("20260329-023000", None, "2026-03-29T01:30:00", "never was"),
+    "spring": ("20260329-033000", None, "2026-03-29T01:30:00", ""),
+}
+
+
+@pytest.mark.parametrize("kind", CHANGES)
+def test_hours_that_clocks_repeat_or_skip(kind):
+    name, container, expected, doubtful = CHANGES[kind]
+    recorded = None if container is None else datetime.fromisoformat(container).replace(tzinfo=UTC)
+    moment, doubt = began(Path(f"{name}.mp4"), "%Y%m%d-%H%M%S", "Europe/Vienna", recorded)
+    assert moment == datetime.fromisoformat(expected).replace(tzinfo=UTC)
+    assert doubtful in doubt
+    assert bool(doubtful) == bool(doubt)
+
+
+@pytest.mark.parametrize("pattern", ["%Y%m%d-%H%M%S", "cam%%1_%y%j%H%M", "%Y-%m-%dT%H%M%S%z", "%d.%m.%y %I %p"])
+def test_good_clock_patterns(pattern):
+    check_pattern(pattern)
+
+
+@pytest.mark.parametrize("pattern", ["%", "%s", "%Y%Y", "cam", "%Y-%m-%d", "%H%M", "%Y%m%d_%I%M"])
+def test_bad_clock_patterns(pattern):
+    with pytest.raises(ValueError, match=r"no time pattern|does not tell"):
+        check_pattern(pattern)
 
 
 @pytest.mark.parametrize("share", [0.5, 0.85])
@@ -169,6 +205,79 @@ def test_since_gaps_and_forms(week):
     assert json.loads(as_text(whole, "json")) == whole
     assert next(csv.DictReader(as_text(whole, "csv").splitlines()))["vehicles"] == "30"
     assert "1 gaps" in as_text(whole, "table")
+
+
+def test_coverage_is_cut_to_what_was_asked_for(week):
+    cut = summarise(week, None, "2026-03-01T06:00:30", "2026-03-01T06:30", None, "UTC")
+    assert cut["groups"][0]["vehicles"] == 0
+    assert (cut["coverage"]["recordings"], cut["coverage"]["hours"]) == (1, round(30 / 3600, 4))
+    assert cut["coverage"]["gaps"] == [{"from_utc": "2026-03-01T06:01:00Z", "to_utc": "2026-03-01T06:30:00Z"}]
+    none = summarise(week, None, "2026-03-02", "2026-03-03", None, "UTC")["coverage"]
+    assert none["recordings"] == none["hours"] == 0
+    assert none["gaps"] == [{"from_utc": "2026-03-02T00:00:00Z", "to_utc": "2026-03-03T00:00:00Z"}]
+    with pytest.raises(UsageError, match="not before"):
+        summarise(week, None, "2026-03-03", "2026-03-02", None, "UTC")
+
+
+def test_recordings_without_a_time_of_day_are_named(week):
+    untimed = [row | {"time_utc": None} for row in _rows([30])]
+    with TrafficLog(week) as log:
+        log.add(_clip(2, None), untimed)
+    assert summarise(week, None, None, None, None, "UTC")["groups"][0]["vehicles"] == 31
+    found = summarise(week, "hour", None, None, None, "UTC")
+    assert found["groups"][0]["vehicles"] == 30
+    assert found["coverage"]["without_time"] == 1
+    assert "1 without a time of day" in as_text(found, "table")
+
+
+def test_an_older_log_is_migrated_and_read(tmp_path):
+    path = tmp_path / "old.sqlite"
+    base = sqlite3.connect(path)
+    base.executescript(MIGRATIONS[0])
+    base.execute(f"PRAGMA application_id = {APPLICATION}")
+    base.execute("PRAGMA user_version = 1")
+    base.execute("INSERT INTO clips VALUES (1, 'sha0', 'a', 'clip0.mp4', NULL, 60.0, 1500, '0.1.0')")
+    base.commit()
+    base.close()
+    assert [clip["name"] for clip in read(path)[0]] == ["clip0.mp4"]
+    with TrafficLog(path) as log:
+        assert not log.add(_clip(), [])
+        assert log.add(_clip(1), _rows([50]))
+    base = sqlite3.connect(path)
+    assert base.execute("PRAGMA user_version").fetchone() == (VERSION,)
+    assert [clip["name"] for clip in read(path)[0]] == ["clip0.mp4", "clip1.mp4"]
+
+
+def test_a_recording_is_hashed_once_until_it_changes(tmp_path):
+    clip = tmp_path / "a.mp4"
+    clip.write_bytes(b"one")
+    with TrafficLog(tmp_path / "s.sqlite") as log:
+        first = log.digest(clip)
+        base = sqlite3.connect(tmp_path / "s.sqlite")
+        assert base.execute("SELECT sha256 FROM files").fetchall() == [(first,)]
+        base.execute("UPDATE files SET sha256 = 'kept'")
+        base.commit()
+        assert log.digest(clip) == "kept"
+        clip.write_bytes(b"two")
+        assert log.digest(clip) == hashlib.sha256(b"two").hexdigest()
+
+
+KILLED_IN_A_TRANSACTION = """
+import os, sqlite3, sys
+base = sqlite3.connect(sys.argv[1], isolation_level=None)
+base.execute("PRAGMA cache_size = 1")
+base.execute("BEGIN IMMEDIATE")
+base.execute("UPDATE vehicles SET speed_kmh = 0")
+base.executemany("INSERT INTO files VALUES (?, 1, 1, 1, 1, 'x')", [(str(k) * 200,) for k in range(2000)])
+os.kill(os.getpid(), 9)
+"""
+
+
+def test_a_writer_killed_in_a_transaction_leaves_the_log_whole(week):
+    before = read(week)
+    subprocess.run([sys.executable, "-c", KILLED_IN_A_TRANSACTION, str(week)], timeout=60)
+    assert week.with_name("s.sqlite-journal").stat().st_size > 0  # it was in the middle of it
+    assert read(week) == before
 
 
 def _visfuse(*args):

@@ -17,6 +17,7 @@ from visfuse_cli.files.traffic_log import read
 from visfuse_cli.files.wall_clock import known_zone
 from visfuse_cli.maths.percentiles import pace, percentile
 
+Span = tuple[datetime, datetime]
 By = Literal["hour", "day", "weekday", "lane", "direction"]
 PACE_KMH = 16.09344  # ten miles an hour, as traffic engineers use it
 SECTOR = 45.0  # degrees
@@ -32,7 +33,8 @@ def summarise(
 ) -> dict[str, Any]:
     """Groups of vehicles with their figures, all of them first, and what time the recordings cover.
 
-    `since` and `until` are ISO 8601, in `zone` where they name none. Raises InputError where the log cannot be read
+    `since` and `until` are ISO 8601, in `zone` where they name none; where times are asked for, recordings without
+    one are left out. Raises InputError where the log cannot be read
     or names no times that are asked for, UsageError where an option makes no sense.
     """
     try:
@@ -40,17 +42,19 @@ def summarise(
     except ValueError as problem:
         raise UsageError(f"--zone: {problem}") from problem
     begin, end = (_moment(text, place, option) for text, option in ((since, "--since"), (until, "--until")))
+    if begin and end and begin >= end:
+        raise UsageError(f"--since {since} is not before --until {until}")
     clips, vehicles = read(log)
-    if (begin or end or by in ("hour", "day", "weekday")) and any(row["time_utc"] is None for row in vehicles):
-        raise InputError(f"{log}: some recordings have no time of day; log them with clock.pattern set")
-    vehicles = [row for row in vehicles if _within(row["time_utc"], begin, end)]
+    if begin or end or by in ("hour", "day", "weekday"):
+        if clips and all(clip["began_utc"] is None for clip in clips):
+            raise InputError(f"{log}: no recording has a time of day; log them with clock.pattern set")
+        vehicles = [row for row in vehicles if row["time_utc"] and _within(row["time_utc"], begin, end)]
     groups = [_figures("all", vehicles, limit_kmh)]
     if by is not None:
         key = _keys(place)[by]
         names = sorted({key(row) for row in vehicles})
         groups += [_figures(label, [row for row in vehicles if key(row)[1] == label], limit_kmh) for _, label in names]
     return {
-        "log": str(log),
         "by": by,
         "limit_kmh": limit_kmh,
         "groups": groups,
@@ -68,9 +72,7 @@ def _moment(text: str | None, place: tzinfo, option: str) -> datetime | None:
     return moment if moment.tzinfo else moment.replace(tzinfo=place)
 
 
-def _within(time_utc: str | None, begin: datetime | None, end: datetime | None) -> bool:
-    if time_utc is None:
-        return True
+def _within(time_utc: str, begin: datetime | None, end: datetime | None) -> bool:
     moment = datetime.fromisoformat(time_utc)
     return (begin is None or moment >= begin) and (end is None or moment < end)
 
@@ -110,27 +112,35 @@ def _figures(name: str, vehicles: Sequence[dict[str, Any]], limit_kmh: float | N
 
 
 def _coverage(clips: Sequence[dict[str, Any]], begin: datetime | None, end: datetime | None) -> dict[str, Any]:
-    """Recordings, hours in them, and the gaps between those whose time of day is known."""
-    spans = sorted(
-        (start, start + timedelta(seconds=clip["duration_s"]))
-        for clip in clips
-        if clip["began_utc"] is not None
-        for start in [datetime.fromisoformat(clip["began_utc"])]
-        if (begin is None or start >= begin) and (end is None or start < end)
-    )
-    gaps, reached = [], spans[0][1] if spans else None
-    for start, finish in spans:
-        assert reached is not None
-        if (start - reached).total_seconds() > GAP_S:
+    """Recordings between two times, hours in them, and the gaps between those whose time of day is known."""
+    timed = [clip for clip in clips if clip["began_utc"] is not None]
+    spans = sorted(span for clip in timed if (span := _cut(_span(clip), begin, end)) is not None)
+    untimed = [clip["duration_s"] for clip in clips if clip["began_utc"] is None]
+    free = 0.0 if begin or end else sum(untimed)
+    gaps, reached = [], begin or (spans[0][0] if spans else None)
+    for start, finish in [*spans, *([(end, end)] if end else [])]:
+        if reached is not None and (start - reached).total_seconds() > GAP_S:
             gaps.append({"from_utc": _iso(reached), "to_utc": _iso(start)})
-        reached = max(reached, finish)
+        reached = finish if reached is None else max(reached, finish)
     return {
-        "recordings": len(clips),
-        "hours": round(sum(clip["duration_s"] for clip in clips) / 3600, 4),
+        "recordings": len(spans) + (0 if begin or end else len(untimed)),
+        "without_time": len(untimed),
+        "hours": round((sum((finish - start).total_seconds() for start, finish in spans) + free) / 3600, 4),
         "from_utc": _iso(spans[0][0]) if spans else None,
-        "to_utc": _iso(reached) if reached else None,
+        "to_utc": _iso(max(finish for _, finish in spans)) if spans else None,
         "gaps": gaps,
     }
+
+
+def _span(clip: dict[str, Any]) -> Span:
+    start = datetime.fromisoformat(clip["began_utc"])
+    return start, start + timedelta(seconds=clip["duration_s"])
+
+
+def _cut(span: Span, begin: datetime | None, end: datetime | None) -> Span | None:
+    """What of a span lies between two times."""
+    start, finish = max(span[0], begin or span[0]), min(span[1], end or span[1])
+    return (start, finish) if start <= finish else None
 
 
 def _iso(moment: datetime) -> str:
@@ -177,7 +187,8 @@ def _table(summary: dict[str, Any]) -> str:
     widths = [max(len(row[k]) for row in rows) for k in range(len(rows[0]))]
     lines = [f"{row[0]:<{widths[0]}}  " + "  ".join(map(str.rjust, row[1:], widths[1:])) for row in rows]
     cover = summary["coverage"]
-    lines.append(f"\n{cover['recordings']} recordings, {cover['hours']:.2f} h; speeds in km/h")
+    untimed = f"; {cover['without_time']} without a time of day" if cover["without_time"] else ""
+    lines.append(f"\n{cover['recordings']} recordings, {cover['hours']:.2f} h{untimed}; speeds in km/h")
     if cover["from_utc"]:
         lines.append(f"{cover['from_utc']} to {cover['to_utc']}, {len(cover['gaps'])} gaps")
         lines += [f"  gap {gap['from_utc']} to {gap['to_utc']}" for gap in cover["gaps"][:10]]

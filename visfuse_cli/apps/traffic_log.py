@@ -6,14 +6,15 @@ import csv
 import hashlib
 import json
 import time
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from visfuse_cli import report
 from visfuse_cli.commands import speed
-from visfuse_cli.errors import InputError, UsageError
-from visfuse_cli.files.folders import describe, is_folder, list_clips
+from visfuse_cli.errors import InputError, UsageError, VisfuseError
+from visfuse_cli.files.folders import IMAGE_SUFFIXES, describe, is_clip_folder, is_folder, list_clips, list_files
 from visfuse_cli.files.runfolder import RunFolder
 from visfuse_cli.files.traffic_log import LoggedClip, TrafficLog
 from visfuse_cli.records import RunRequest, RunResult
@@ -29,52 +30,81 @@ def run(request: RunRequest, log: Path, new_only: bool = False) -> RunResult:
     if new_only:
         return _run_new(request, log)
     with TrafficLog(log) as held:  # a log that cannot be written is told before hours of work
-        result = speed.run(request)
-        if result.stopped_by is None:
-            _append(request.out, held, _settings(request))
+        return _measure(request, held, _settings(request))
+
+
+def _measure(request: RunRequest, log: TrafficLog, settings: str) -> RunResult:
+    """Measure, write the page, and only then log: what a kill leaves out of the log is done again as a whole."""
+    result = speed.run(request)
     if request.report:
         report.write([request.out])
+    if result.stopped_by is None:
+        _append(request.out, log, settings)
     return result
 
 
 def _run_new(request: RunRequest, log: Path) -> RunResult:
-    settings, warnings, done = _settings(request), list[str](), list[RunResult]()
-    unreadable: list[str] = []
-    waiting = 0
     if not is_folder(request.input):
         raise UsageError(f"--new-only: {request.input} is one recording; give the folder that new clips arrive in")
+    if not is_clip_folder(request.input) and list_files(request.input, IMAGE_SUFFIXES):
+        raise UsageError(f"--new-only: {request.input} holds images, which are one recording; give a folder of clips")
+    settings, done = _settings(request), list[RunResult]()
+    failed: list[Exception] = []
+    waiting = 0
     with TrafficLog(log) as held, RunFolder(request.out, shared=True):
-        for clip in list_clips(request.input):
-            if time.time() - clip.stat().st_mtime < UNCHANGED_S:
+        clips = list_clips(request.input)
+        for clip in clips:
+            if _changed_s_ago(clip) < UNCHANGED_S:
                 waiting += 1
                 continue
-            if held.holds(describe(clip)["sha256"], settings):
-                continue
-            own = replace(request, input=clip, out=request.out / clip.stem, overwrite=True)
             try:
-                done.append(speed.run(own))
-            except InputError as problem:
-                unreadable.append(str(problem))
+                if held.holds(held.digest(clip), settings):
+                    continue
+                done.append(_measure(_own(request, clip, clips), held, settings))
+            except Exception as problem:
+                if isinstance(problem, VisfuseError) and not isinstance(problem, InputError):
+                    raise
+                failed.append(problem)  # neither a bad clip nor a defect keeps the clips behind it from the log
                 continue
-            warnings += done[-1].warnings
             if done[-1].stopped_by is not None:
                 break
-            _append(own.out, held, settings)
-            if request.report:
-                report.write([own.out])
-    if unreadable:
-        others = f"; {len(unreadable) - 1} more like it" if len(unreadable) > 1 else ""
-        raise InputError(f"{unreadable[0]}{others}; the other clips are in the log")
-    summary = {
-        "clips": len(done),
-        "vehicles": sum(result.summary["vehicles"] for result in done),
-        "rejected": sum(result.summary["rejected"] for result in done),
-        "still_changing": waiting,
-        "log": str(log),
-        "out": str(request.out),
-    }
-    stopped = next((result.stopped_by for result in done if result.stopped_by is not None), None)
-    return RunResult(request.out, summary, tuple(warnings), stopped)
+    if failed:
+        raise _first(failed)
+    return RunResult(
+        request.out,
+        _summary(done, waiting) | {"log": str(log), "out": str(request.out)},
+        tuple(warning for result in done for warning in result.warnings),
+        next((result.stopped_by for result in done if result.stopped_by is not None), None),
+    )
+
+
+def _changed_s_ago(clip: Path) -> float:
+    """Seconds since a clip was last written to; by the entry's own time where the content's lies in the future."""
+    try:
+        now, found = time.time(), clip.stat()
+    except FileNotFoundError:  # taken away since the folder was listed
+        return 0.0
+    return now - (found.st_mtime if found.st_mtime <= now else found.st_ctime)
+
+
+def _own(request: RunRequest, clip: Path, clips: Sequence[Path]) -> RunRequest:
+    """The request for one clip, to a folder of its name; with its ending where another clip has the same stem."""
+    twins = sum(other.stem == clip.stem for other in clips) > 1
+    return replace(request, input=clip, out=request.out / (clip.name if twins else clip.stem), overwrite=True)
+
+
+def _first(failed: Sequence[Exception]) -> Exception:
+    """What to say of clips that failed: a defect before a bad clip."""
+    defect = next((problem for problem in failed if not isinstance(problem, VisfuseError)), None)
+    if defect is not None:
+        return defect
+    others = f"; {len(failed) - 1} more like it" if len(failed) > 1 else ""
+    return InputError(f"{failed[0]}{others}; the other clips are in the log")
+
+
+def _summary(done: Sequence[RunResult], waiting: int) -> dict[str, Any]:
+    totals = {name: sum(result.summary[name] for result in done) for name in ("vehicles", "rejected")}
+    return {"clips": len(done), **totals, "still_changing": waiting}
 
 
 def _settings(request: RunRequest) -> str:

@@ -24,7 +24,7 @@ from visfuse_cli.files.runfolder import RunFolder
 from visfuse_cli.files.spool import TrackSpool, write_table
 from visfuse_cli.files.video import VideoSource, describe, is_clip_folder, list_clips, open_source
 from visfuse_cli.files.video_writer import VideoWriter
-from visfuse_cli.files.wall_clock import began, known_zone
+from visfuse_cli.files.wall_clock import began, check_pattern, known_zone
 from visfuse_cli.maths.cameras import ground_camera
 from visfuse_cli.pipeline import Run
 from visfuse_cli.records import Array, GroundCamera, GroundMap, Image, RunRequest, RunResult, TimeAudit
@@ -57,6 +57,13 @@ class ClockSettings(Section):
         None, description="strptime pattern of a clip's whole name without its ending, like cam1_%Y%m%d-%H%M%S"
     )
     zone: str = Field("UTC", description="IANA time zone of the times in names, like Europe/Vienna")
+
+    @field_validator("pattern")
+    @classmethod
+    def _tells_the_hour(cls, pattern: str | None) -> str | None:
+        if pattern is not None:
+            check_pattern(pattern)
+        return pattern
 
     @field_validator("zone")
     @classmethod
@@ -101,6 +108,7 @@ class _Results:
     drawn: dict[str, list[tuple[int, int]]] = field(default_factory=dict)  # clip -> (first frame, id)
     audits: dict[str, TimeAudit] = field(default_factory=dict)
     began: dict[str, datetime | None] = field(default_factory=dict)
+    doubts: list[str] = field(default_factory=list)  # about times of day
     watches: dict[str, CameraWatch] = field(default_factory=dict)
 
 
@@ -129,12 +137,16 @@ def run(request: RunRequest) -> RunResult:
     for path in clips:
         with _open(path, request) as source:
             _check_size(source, ground, path)
-            results.began[path.name] = began(path, config.clock.pattern, config.clock.zone, source.creation_time)
+            moment, doubt = began(path, config.clock.pattern, config.clock.zone, source.creation_time)
+            results.began[path.name] = moment
+            results.doubts += [doubt] if doubt else []
     with (
         RunFolder(request.out, request.overwrite) as folder,
         Run(request.progress) as run_,
         TrackSpool(folder, "speed", request.seed, "ground") as spool,
     ):
+        for doubt in results.doubts:
+            run_.warn(doubt)
         next_id = 1
         for path in clips:
             with _open(path, request) as source:

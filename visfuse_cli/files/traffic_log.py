@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sqlite3
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -10,8 +11,9 @@ from pathlib import Path
 from typing import Any
 
 from visfuse_cli.errors import BusyError, InputError, OutputError
+from visfuse_cli.files.folders import describe
 
-APPLICATION, VERSION = 0x56465331, 1  # "VFS1"
+APPLICATION = 0x56465331  # "VFS1"
 WAIT_S = 60.0  # for another writer
 FIELDS = tuple(
     "track_id t_start t_end time_utc direction lane speed_kmh ci95_low_kmh ci95_high_kmh distance_m n_frames".split()
@@ -28,7 +30,13 @@ MIGRATIONS = (  # from version i to i + 1
         ci95_low_kmh REAL NOT NULL, ci95_high_kmh REAL NOT NULL, distance_m REAL NOT NULL, n_frames INTEGER NOT NULL,
         PRIMARY KEY (clip, track_id)) WITHOUT ROWID;
     """,
+    """
+    CREATE TABLE files (
+        path TEXT PRIMARY KEY, size INTEGER NOT NULL, mtime_ns INTEGER NOT NULL, ctime_ns INTEGER NOT NULL,
+        inode INTEGER NOT NULL, sha256 TEXT NOT NULL) WITHOUT ROWID;
+    """,
 )
+VERSION = len(MIGRATIONS)
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,6 +77,20 @@ class TrafficLog:
         with self._problems():
             found = self._base.execute("SELECT 1 FROM clips WHERE sha256 = ? AND settings = ?", (sha256, settings))
             return found.fetchone() is not None
+
+    def digest(self, path: Path) -> str:
+        """The SHA-256 of a recording; one that has not changed since it was last asked for is not read again."""
+        known = (os.path.abspath(path), *_state(path))
+        kept = "path = ? AND size = ? AND mtime_ns = ? AND ctime_ns = ? AND inode = ?"
+        with self._problems():
+            found = self._base.execute(f"SELECT sha256 FROM files WHERE {kept}", known).fetchone()
+        if found is not None:
+            return str(found[0])
+        digest = str(describe(path)["sha256"])
+        if _state(path) == known[1:]:  # it was not written to meanwhile
+            with self._problems():
+                self._base.execute("INSERT OR REPLACE INTO files VALUES (?, ?, ?, ?, ?, ?)", (*known, digest))
+        return digest
 
     def add(self, clip: LoggedClip, vehicles: Sequence[Mapping[str, Any]]) -> bool:
         """Add a recording and its rows of speeds.csv in one transaction; False, and nothing, where it is there."""
@@ -119,7 +141,9 @@ def read(path: Path) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
     if not path.is_file():
         raise InputError(f"{path}: there is no such log; `visfuse speed --log` writes one")
     try:
-        base = sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro", uri=True, timeout=WAIT_S)
+        # What a killed writer left half done is rolled back on reading, which takes the right to write.
+        mode = "rw" if os.access(path, os.W_OK) and os.access(path.resolve().parent, os.W_OK) else "ro"
+        base = sqlite3.connect(f"{path.resolve().as_uri()}?mode={mode}", uri=True, timeout=WAIT_S)
         try:
             _check(base, path)
             base.row_factory = sqlite3.Row
@@ -128,13 +152,22 @@ def read(path: Path) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
             clips = base.execute(f"SELECT * FROM clips WHERE id IN {latest} ORDER BY name, sha256").fetchall()
             vehicles = base.execute(
                 f"SELECT clips.name AS clip_name, clips.sha256, vehicles.* FROM vehicles JOIN clips ON clip = id "
-                f"WHERE clip IN {latest} ORDER BY clips.name, t_start, track_id"
+                f"WHERE clip IN {latest} ORDER BY clips.name, clips.sha256, t_start, track_id"
             ).fetchall()
         finally:
             base.close()
     except sqlite3.DatabaseError as problem:
         raise InputError(f"{path}: not a traffic log that can be read: {problem}") from problem
     return [dict(row) for row in clips], [dict(row) for row in vehicles]
+
+
+def _state(path: Path) -> tuple[int, int, int, int]:
+    """What changes when a file does: size, times of its content and its entry (ns), inode."""
+    try:
+        found = path.stat()
+    except OSError as problem:
+        raise InputError(f"{path}: cannot be read: {problem.strerror}") from problem
+    return found.st_size, found.st_mtime_ns, found.st_ctime_ns, found.st_ino
 
 
 def _check(base: sqlite3.Connection, path: Path) -> int:
