@@ -38,6 +38,7 @@ MAY_IMPORT = {
     },
     "evaluate": {"maths", "files", "records", "errors"},
     "report": {"maths", "files", "records", "errors"},
+    "export": {"files", "records", "errors"},
 }
 OUTSIDE_OF_MATHS = {"numpy", "scipy"}
 

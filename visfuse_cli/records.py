@@ -125,6 +125,14 @@ class Sighting:
 
 
 @dataclass(frozen=True, slots=True)
+class GroundReference:
+    """Where a ground plane lies on earth: easting = X + origin[0], northing = Y + origin[1], metres of an EPSG code."""
+
+    code: str
+    origin: tuple[float, float]
+
+
+@dataclass(frozen=True, slots=True)
 class GroundMap:
     """Image (or gaze frontal plane) to ground metres: a homography with the covariance of its entries.
 
@@ -142,6 +150,7 @@ class GroundMap:
     rms_px: float
     residuals: tuple[dict[str, Any], ...] = ()
     source: str = ""
+    reference: GroundReference | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -160,19 +160,6 @@ def as_text(summary: dict[str, Any], form: Literal["table", "csv", "json"]) -> s
     return _table(summary)
 
 
-def write_parquet(summary: dict[str, Any], path: Path) -> None:
-    """The groups as a Parquet file; raises UsageError where pyarrow is not installed."""
-    try:
-        import pyarrow as arrow
-        import pyarrow.parquet as parquet
-    except ImportError as problem:
-        raise UsageError("--format parquet needs pyarrow: pip install 'visfuse-cli[parquet]'") from problem
-    from visfuse_cli.files.atomic import replacing_path
-
-    with replacing_path(path) as partial:
-        parquet.write_table(arrow.Table.from_pylist(summary["groups"]), partial)
-
-
 def _table(summary: dict[str, Any]) -> str:
     head = ("", "vehicles", "mean", "50 % [95 % interval]", "85 % [95 % interval]", "pace (share)")
     rows = [head + ((f"> {summary['limit_kmh']:g}",) if summary["limit_kmh"] is not None else ())]

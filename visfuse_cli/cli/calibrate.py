@@ -35,6 +35,12 @@ def calibrate_homography(
     camera: Annotated[
         Path | None, typer.Option("--camera", metavar="F", help="Lens: calibration.yaml with M1 and D1.")
     ] = None,
+    crs: Annotated[
+        str | None, typer.Option("--crs", metavar="EPSG:N", help="Coordinate reference of X (east) and Y (north).")
+    ] = None,
+    origin: Annotated[
+        str | None, typer.Option("--origin", metavar="E,N", help="What was taken off X and Y; with --crs.")
+    ] = None,
     config: ConfigOption = None,
     set_: SetOption = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace H.json.")] = False,
@@ -46,6 +52,7 @@ def calibrate_homography(
     Example: visfuse calibrate-homography --points points.csv --image clip.mp4 --out H.json
     """
     from visfuse_cli.commands import calibrate_homography as command
+    from visfuse_cli.files.ground_reference import parse_reference
     from visfuse_cli.records import RunRequest
 
     sources = {"points": points, "lines": lines, "gaze": gaze}
@@ -57,7 +64,8 @@ def calibrate_homography(
         input=next(path for path in sources.values() if path is not None),
         out=out,
         config=load_config("calibrate-homography", config, set_),
-        options=sources | {"image": image, "size": _size(size), "camera": camera},
+        options=sources
+        | {"image": image, "size": _size(size), "camera": camera, "reference": parse_reference(crs, origin)},
         overwrite=overwrite,
         argv=tuple(sys.argv),
     )

@@ -102,10 +102,38 @@ def summary(
         raise UsageError("--format parquet is no text; name a file with --out")
     found = command.summarise(log, by, since, until, limit, zone)  # type: ignore[arg-type]
     if form == "parquet" and out is not None:
-        command.write_parquet(found, out)
+        from visfuse_cli.files.parquet import write_parquet
+
+        write_parquet(out, command.COLUMNS, found["groups"])
     elif out is not None:
         from visfuse_cli.files.atomic import write_text
 
         write_text(out, command.as_text(found, form) + "\n")  # type: ignore[arg-type]
     else:
         typer.echo(command.as_text(found, form))  # type: ignore[arg-type]
+
+
+@app.command("export")
+def export(
+    source: Annotated[Path, typer.Argument(metavar="RUN", help="Folder of a run, or a traffic log.")],
+    form: Annotated[
+        str, typer.Option("--format", metavar="FORM", help="csv, json, parquet, mot, geojson or gpkg.")
+    ] = "csv",
+    out: Annotated[Path | None, typer.Option("--out", metavar="FILE", help="To a file instead of the screen.")] = None,
+    rejected: Annotated[bool, typer.Option("--rejected", help="The tracks that were rejected, too.")] = False,
+    view: Annotated[str | None, typer.Option("--view", metavar="NAME", help="mot: boxes of this view.")] = None,
+    clip: Annotated[str | None, typer.Option("--clip", metavar="NAME", help="mot: boxes of this clip.")] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace FILE.")] = False,
+    quiet: QuietOption = False,
+) -> None:
+    """Tracks of a run, or vehicles of a traffic log, for other programs.
+
+    Example: visfuse export run --format mot --out tracks.txt
+    """
+    from visfuse_cli.export.run import export as write
+
+    text = write(source, form, out, rejected=rejected, view=view, clip=clip, overwrite=overwrite)
+    if text is not None:
+        typer.echo(text)
+    elif not (quiet or voice.quiet):
+        typer.echo(f"{form:<12} {out}")

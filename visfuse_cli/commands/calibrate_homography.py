@@ -116,6 +116,7 @@ def run(request: RunRequest) -> RunResult:
         rms_px=survey.fit.rms_px,
         residuals=_residuals(survey.fit),
         source=request.input.name,
+        reference=options.get("reference"),
     )
     picture = b""
     if image is not None and picture_path is not None:

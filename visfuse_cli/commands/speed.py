@@ -6,7 +6,7 @@ frames -> steady -> background -> regions -> tracker (predict, measure, update) 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any, Literal
@@ -181,6 +181,7 @@ def run(request: RunRequest) -> RunResult:
                 "summary": summary,
                 "began_utc": {name: _utc(moment, 0.0) or None for name, moment in results.began.items()},
                 "camera": {name: watch.report() for name, watch in results.watches.items()},
+                "crs": None if ground.reference is None else asdict(ground.reference),
                 "annotated_by": "a second decode of the footage" if request.video else None,
             },
         )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,7 @@ import numpy as np
 
 from visfuse_cli.errors import InputError
 from visfuse_cli.files.atomic import write_json
-from visfuse_cli.records import Array, GroundMap, Lens
+from visfuse_cli.records import Array, GroundMap, GroundReference, Lens
 
 SCHEMA = "visfuse.homography/1"
 COEFFICIENTS = (4, 5, 8, 12, 14)  # lengths of OpenCV's distortion
@@ -31,6 +32,7 @@ def write(path: Path, ground: GroundMap) -> None:
         "rms_px": ground.rms_px,
         "residuals": list(ground.residuals),
         "source": ground.source,
+        "crs": None if ground.reference is None else asdict(ground.reference),
     }
     write_json(path, document)
 
@@ -72,6 +74,7 @@ def read(path: Path) -> GroundMap:
         rms_px=_spread(path, document, "rms_px"),
         residuals=_residuals(path, document),
         source=str(document.get("source") or ""),
+        reference=_reference(path, document),
     )
 
 
@@ -134,6 +137,16 @@ def _lens(path: Path, document: dict[str, Any]) -> Lens | None:
     if count not in COEFFICIENTS:
         raise InputError(f'{path}: "lens.D" must be a list of {", ".join(map(str, COEFFICIENTS))} coefficients')
     return Lens(K, _array(path, value, "D", (count,)))
+
+
+def _reference(path: Path, document: dict[str, Any]) -> GroundReference | None:
+    value = document.get("crs")
+    if value is None:
+        return None
+    if not (isinstance(value, dict) and isinstance(value.get("code"), str)):
+        raise InputError(f'{path}: "crs" must be {{"code": "EPSG:...", "origin": [E, N]}}, or null')
+    easting, northing = _array(path, value, "origin", (2,)).tolist()
+    return GroundReference(value["code"], (easting, northing))
 
 
 def _residuals(path: Path, document: dict[str, Any]) -> tuple[dict[str, Any], ...]:
