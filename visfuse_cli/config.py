@@ -130,7 +130,7 @@ def _source(name: str | None) -> tuple[str, str]:
     if name is None:
         return "", "defaults"
     path = Path(name)
-    if path.suffix == "" and path.name == name and not path.exists():
+    if path.suffix == "" and path.name == name and not path.is_file():
         known = shipped()
         if name not in known:
             raise UsageError(

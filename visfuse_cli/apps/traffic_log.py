@@ -25,8 +25,12 @@ UNCHANGED_S = 60.0  # a clip that is still being written changes
 def run(request: RunRequest, log: Path, new_only: bool = False) -> RunResult:
     """Measure, and add each recording to the log; with `new_only`, each clip of a folder that the log does not hold.
 
-    Raises what `speed` raises, and UsageError where `new_only` is asked of anything but a folder of clips.
+    Lanes that are found are kept beside the log, so that a number stays with its lane. Raises what `speed` raises, and
+    UsageError where `new_only` is asked of anything but a folder of clips.
     """
+    if not request.config.lanes and request.config.lanes_file is None:
+        kept = request.config.model_copy(update={"lanes_file": log.with_suffix(".lanes.yaml")})
+        request = replace(request, config=kept)
     if new_only:
         return _run_new(request, log)
     with TrafficLog(log) as held:  # a log that cannot be written is told before hours of work
@@ -110,7 +114,7 @@ def _summary(done: Sequence[RunResult], waiting: int) -> dict[str, Any]:
 def _settings(request: RunRequest) -> str:
     """The hash of all that the speeds of a clip depend on, but for the clip."""
     used: dict[str, Any] = {
-        "config": request.config.model_dump(mode="json"),
+        "config": request.config.model_dump(mode="json", exclude={"lanes_file", "display"}),
         "homography": describe(request.options["homography"])["sha256"],
         "start": request.start,
         "end": request.end,

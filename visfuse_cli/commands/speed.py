@@ -6,39 +6,46 @@ frames -> steady -> background -> regions -> tracker (predict, measure, update) 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from pydantic import Field, field_validator
 
 from visfuse_cli.config import Section
-from visfuse_cli.errors import InputError
+from visfuse_cli.errors import InputError, UsageError
 from visfuse_cli.files import detections as detection_files
 from visfuse_cli.files import homography as homography_files
 from visfuse_cli.files.atomic import replacing
+from visfuse_cli.files.lanes_file import read_lanes, write_lanes
 from visfuse_cli.files.run_json import write_run_json
 from visfuse_cli.files.runfolder import RunFolder
 from visfuse_cli.files.spool import TrackSpool, write_table
 from visfuse_cli.files.video import VideoSource, describe, is_clip_folder, list_clips, open_source
 from visfuse_cli.files.video_writer import VideoWriter
 from visfuse_cli.files.wall_clock import began, check_pattern, known_zone
-from visfuse_cli.maths.cameras import ground_camera
+from visfuse_cli.maths.cameras import ground_camera, project, raised
+from visfuse_cli.maths.polygons import Polygon
 from visfuse_cli.pipeline import Run
 from visfuse_cli.records import Array, GroundCamera, GroundMap, Image, RunRequest, RunResult, TimeAudit
-from visfuse_cli.tracking.annotate import UNITS, annotate
+from visfuse_cli.tracking.annotate import annotate
 from visfuse_cli.tracking.camera_watch import CameraWatch
 from visfuse_cli.tracking.conclude import conclude
-from visfuse_cli.tracking.foreground import BackgroundSettings, Detections, Detector, MovingRegions, RegionSettings
+from visfuse_cli.tracking.foreground import Detections, Detector, MovingRegions
 from visfuse_cli.tracking.ground import GroundTracker
-from visfuse_cli.tracking.output import COLUMNS, Polygon, abandoned_row, lane_of, row_of, track_record
-from visfuse_cli.tracking.settings import TrackerSettings
+from visfuse_cli.tracking.lanes import Way, find_lanes, lane_of, thinned
+from visfuse_cli.tracking.options import SpeedOptions
+from visfuse_cli.tracking.output import COLUMNS, abandoned_row, row_of, track_record
+from visfuse_cli.tracking.summary import summarised, text
 from visfuse_cli.tracking.targets import Abandoned, Track
-from visfuse_cli.tracking.verdict import SpeedSettings, judge
+from visfuse_cli.tracking.verdict import judge
+from visfuse_cli.tracking.zones import Region, trusted
 from visfuse_cli.vision.background import empty_picture
 from visfuse_cli.vision.steady import at_rest
+
+__all__ = ["SpeedConfig", "run", "text"]
 
 WARMUP_PICTURES = 31
 SEEN_FRAMES = 8  # a region seen for fewer frames than this is noise and not worth a line in the ledger
@@ -72,30 +79,11 @@ class ClockSettings(Section):
         return zone
 
 
-class DisplaySettings(Section):
-    """Annotation and screen only; tables keep their units."""
-
-    units: Literal["km/h", "mph", "m/s"] = Field("km/h", description="unit of speed on the video and the screen")
-
-
-class SpeedConfig(TrackerSettings):
+class SpeedConfig(SpeedOptions):
     """Configuration of `visfuse speed`."""
 
     video: VideoSettings = VideoSettings()
     clock: ClockSettings = ClockSettings()
-    background: BackgroundSettings = BackgroundSettings()
-    regions: RegionSettings = RegionSettings()
-    speed: SpeedSettings = SpeedSettings()
-    lanes: tuple[Polygon, ...] = Field((), description="polygons of ground points [X, Y] m, numbered from 1")
-    display: DisplaySettings = DisplaySettings()
-
-    @field_validator("lanes")
-    @classmethod
-    def _polygons(cls, lanes: tuple[Polygon, ...]) -> tuple[Polygon, ...]:
-        for number, polygon in enumerate(lanes, start=1):
-            if len(polygon) < 3:
-                raise ValueError(f"lane {number} has {len(polygon)} corners; a polygon needs three or more")
-        return lanes
 
 
 @dataclass(slots=True)
@@ -105,6 +93,7 @@ class _Results:
     rows: list[dict[str, Any]] = field(default_factory=list)
     rejected: list[dict[str, Any]] = field(default_factory=list)
     speeds: list[float] = field(default_factory=list)  # m/s
+    ways: dict[int, Way] = field(default_factory=dict)  # track -> where it drove while it was measured
     drawn: dict[str, list[tuple[int, int]]] = field(default_factory=dict)  # clip -> (first frame, id)
     audits: dict[str, TimeAudit] = field(default_factory=dict)
     began: dict[str, datetime | None] = field(default_factory=dict)
@@ -130,13 +119,14 @@ def run(request: RunRequest) -> RunResult:
     several = is_clip_folder(request.input)
     clips = list_clips(request.input) if several else [request.input]
     boxes = _boxes(request.options.get("detections"), several)
-    inputs = [
-        describe(path) for path in (*clips, request.options["homography"], request.options.get("detections")) if path
-    ]
+    known = config.lanes or (read_lanes(config.lanes_file) if config.lanes_file is not None else None)
+    given = (request.options["homography"], request.options.get("detections"), known and config.lanes_file)
+    inputs = [describe(path) for path in (*clips, *given) if path]
     results = _Results()
     for path in clips:
         with _open(path, request) as source:
             _check_size(source, ground, path)
+            _camera(ground, source, config)
             moment, doubt = began(path, config.clock.pattern, config.clock.zone, source.creation_time)
             results.began[path.name] = moment
             results.doubts += [doubt] if doubt else []
@@ -150,20 +140,24 @@ def run(request: RunRequest) -> RunResult:
         next_id = 1
         for path in clips:
             with _open(path, request) as source:
-                camera = ground_camera(ground, (source.width, source.height))
+                camera = _camera(ground, source, config)
                 clip = _Clip(path.name, source, camera, config, boxes)
                 next_id = _track(clip, run_, spool, results, next_id, path.name if several else None)
             if run_.stopped_by is not None:
                 break
+        lanes = known or _found_lanes(results, camera, config, run_)
+        _settle_lanes(results, lanes, folder, None if known else config.lanes_file)
         write_table(folder / "speeds.csv", COLUMNS, results.rows)
         write_table(folder / "rejected.csv", (*COLUMNS, "reason"), results.rejected)
         if request.video and run_.stopped_by is None:
             for path in clips:
                 if path.name in results.drawn:
                     name = f"annotated-{path.stem}.mp4" if several else "annotated.mp4"
-                    _annotate(path, folder / name, ground, request, run_, spool, results)
+                    _annotate(path, folder / name, ground, request, run_, spool, results, lanes)
         _keep_calibration_picture(request.options["homography"], folder)
-        summary = _summary(results, run_, config, folder)
+        summary = summarised(
+            results.speeds, len(results.rejected), config.display.units, run_.counts["frames"], results.audits, folder
+        )
         write_run_json(
             folder / "run.json",
             command="speed",
@@ -182,6 +176,7 @@ def run(request: RunRequest) -> RunResult:
                 "began_utc": {name: _utc(moment, 0.0) or None for name, moment in results.began.items()},
                 "camera": {name: watch.report() for name, watch in results.watches.items()},
                 "crs": None if ground.reference is None else asdict(ground.reference),
+                "lanes": lanes,
                 "annotated_by": "a second decode of the footage" if request.video else None,
             },
         )
@@ -201,6 +196,16 @@ def _boxes(path: Path | None, several: bool) -> dict[int, Array] | None:
     if several:
         raise InputError(f"{path}: detections belong to one recording; give speed one clip, not a folder of clips")
     return detection_files.read_mot(path)
+
+
+def _camera(ground: GroundMap, source: VideoSource, config: SpeedConfig) -> GroundCamera:
+    """The camera over the plane that targets stand on."""
+    size = source.width, source.height
+    camera = ground_camera(replace(ground, image_size=size), size)
+    try:
+        return raised(camera, config.target.height)
+    except ValueError as problem:
+        raise UsageError(f"target.height: {problem}") from problem
 
 
 def _open(path: Path, request: RunRequest) -> VideoSource:
@@ -247,10 +252,11 @@ def _track(clip: _Clip, run_: Run, spool: TrackSpool, results: _Results, first_i
 
 
 def _detector(clip: _Clip, empty: Image) -> Detector:
-    if clip.boxes is not None:
-        return Detections(clip.camera, clip.boxes)
     config = clip.config
-    return MovingRegions(clip.camera, config.background, config.regions, config.target.smallest, empty)
+    region = Region(np.array(config.region)) if config.region else None
+    if clip.boxes is not None:
+        return Detections(clip.camera, clip.boxes, region)
+    return MovingRegions(clip.camera, config.background, config.regions, config.target.smallest, empty, region)
 
 
 def _sampled(source: VideoSource, warmup_s: float) -> Iterator[Any]:
@@ -280,13 +286,20 @@ def _settle(
 ) -> None:
     """Turn what ended into records and table rows."""
     config, begun = clip.config, results.began[clip.name]
+    region = Region(np.array(config.region)) if config.region else None
+    watch = results.watches[clip.name]
     for track in tracks:
-        path = conclude(track, clip.camera, config, tracker.dynamics)
-        verdict = judge(path, clip.camera.ground.cov, config.pose.bias_px, config.speed)
-        spool.add(track_record(path, verdict, clip.camera, label, results.watches[clip.name].image_from_rest))
+        whole = conclude(track, clip.camera, config, tracker.dynamics)
+        path = whole if region is None else region.part(whole)
+        if path is None:
+            continue
+        position = path.planar.mean[:, :2]
+        zone = trusted(clip.camera, position, config.pose.bias_px, config.speed.max_calibration)
+        verdict = judge(path, clip.camera.ground.cov, config.pose.bias_px, config.speed, zone)
+        spool.add(track_record(path, verdict, clip.camera, label, watch.image_from_rest, config.latency))
         results.drawn[clip.name].append((int(path.frame[0]), path.id))
-        lane = lane_of(path.planar.mean[(verdict.first + verdict.last) // 2, :2], config.lanes)
-        row = row_of(path, verdict, clip.name, _utc(begun, path.t[verdict.first]), lane)
+        results.ways[path.id] = thinned(position[verdict.first : verdict.last + 1])
+        row = row_of(path, verdict, clip.name, _utc(begun, path.t[verdict.first]))
         if verdict.reason:
             results.rejected.append(row)
             run_.count("rejected")
@@ -295,9 +308,36 @@ def _settle(
             results.speeds.append(verdict.speed)
             run_.count("vehicles")
     for candidate in abandoned:
-        if candidate.position is not None and candidate.n_frames >= SEEN_FRAMES:
+        place = candidate.position
+        inside = place is not None and (region is None or bool(region.holds(np.array(place))))
+        if inside and candidate.n_frames >= SEEN_FRAMES:
             results.rejected.append(abandoned_row(candidate, clip.name, _utc(begun, candidate.t_start)))
         run_.count("regions that never became a track")
+
+
+def _found_lanes(results: _Results, camera: GroundCamera, config: SpeedConfig, run_: Run) -> tuple[Polygon, ...]:
+    """Lanes from where the vehicles of all clips drove, if that is asked for and there were enough of them."""
+    if not config.lane_finding.find or config.target.motion != "bicycle":
+        return ()
+
+    def image_of(ground: Array) -> Array:
+        return project(camera, np.column_stack([ground, np.zeros(len(ground))]))[0]
+
+    lanes = find_lanes([results.ways[row["track_id"]] for row in results.rows], config.lane_finding, image_of)
+    if config.lanes_file is not None and not lanes:
+        run_.warn(f"{config.lanes_file}: not written: {len(results.rows)} vehicles tell of no lane")
+    return lanes
+
+
+def _settle_lanes(results: _Results, lanes: tuple[Polygon, ...], folder: Path, missing: Path | None) -> None:
+    """Tell each vehicle its lane, and keep the lanes that were used; also where they are `missing` so far."""
+    for row in (*results.rows, *results.rejected):
+        if row["track_id"] in results.ways:
+            row["lane"] = lane_of(results.ways[row["track_id"]], lanes)
+    if lanes:
+        write_lanes(folder / "lanes.yaml", lanes)
+        if missing is not None:
+            write_lanes(missing, lanes)
 
 
 def _utc(begun: datetime | None, t: float) -> str:
@@ -315,18 +355,20 @@ def _annotate(
     run_: Run,
     spool: TrackSpool,
     results: _Results,
+    lanes: tuple[Polygon, ...],
 ) -> None:
     """Write the annotated video of one clip from a second decode; a stop request ends it early and readable."""
-    units = request.config.display.units
+    config: SpeedConfig = request.config
+    places = {f"lane {number}": lane for number, lane in enumerate(lanes, start=1)} | {"region": config.region}
     with _open(path, request) as source:
-        camera = ground_camera(ground, (source.width, source.height))
+        camera = _camera(ground, source, request.config)
         records = (spool.read(identity) for _, identity in sorted(results.drawn[path.name]))
         watch = results.watches[path.name]
         with (
             VideoWriter(out, source.width, source.height, source.nominal_rate) as video,
             run_.background(video) as sink,
         ):
-            for frame in annotate(run_.frames(source), records, camera, units, watch):
+            for frame in annotate(run_.frames(source), records, camera, config.display.units, watch, places):
                 sink.write(frame.image, frame.t)
 
 
@@ -336,48 +378,3 @@ def _keep_calibration_picture(homography: Path, folder: Path) -> None:
     if picture.is_file():
         with replacing(folder / "calibration.png") as file:
             file.write(picture.read_bytes())
-
-
-def _summary(results: _Results, run_: Run, config: SpeedConfig, folder: Path) -> dict[str, Any]:
-    factor, units = UNITS[config.display.units], config.display.units
-    speeds = np.array(results.speeds) * factor
-    return {
-        "vehicles": len(results.rows),
-        "rejected": len(results.rejected),
-        "units": units,
-        "median": round(float(np.median(speeds)), 2) if len(speeds) else None,
-        "percentile_85": round(float(np.percentile(speeds, 85)), 2) if len(speeds) else None,
-        "frames": run_.counts["frames"],
-        "time_audit": {
-            name: {
-                "frames": audit.frames,
-                "duration_s": round(audit.duration_s, 3),
-                "dropped": audit.dropped,
-                "irregular": audit.irregular,
-                "duplicated": audit.duplicated,
-                "lost": audit.lost,
-            }
-            for name, audit in results.audits.items()
-        },
-        "out": str(folder),
-    }
-
-
-def text(result: RunResult) -> str:
-    """The summary for people."""
-    summary = result.summary
-    lines = [f"{'vehicles':<12} {summary['vehicles']}"]
-    if summary["vehicles"]:
-        lines += [
-            f"{'median':<12} {summary['median']:.1f} {summary['units']}",
-            f"{'85th perc.':<12} {summary['percentile_85']:.1f} {summary['units']}",
-        ]
-    lines.append(f"{'rejected':<12} {summary['rejected']} (reasons in rejected.csv)")
-    for name, audit in summary["time_audit"].items():
-        lines.append(
-            f"{'times':<12} {name}: {audit['frames']} frames over {audit['duration_s']:.2f} s, "
-            f"{audit['dropped']} dropped, {audit['irregular']} irregular, "
-            f"{audit['duplicated']} duplicated, {audit['lost']} lost"
-        )
-    lines.append(f"{'results':<12} {summary['out']}")
-    return "\n".join(lines)

@@ -14,7 +14,7 @@ LOCK = ".visfuse.lock"
 TRACKS_PARTIAL = ".tracks.partial.jsonl"
 RESULTS = (
     *("tracks.json", "speeds.csv", "rejected.csv", "run.json", "report.html", "evaluation.json"),
-    *("calibration.png", "map.png", "mosaic.mp4", "annotated*.mp4"),
+    *("calibration.png", "lanes.yaml", "map.png", "mosaic.mp4", "annotated*.mp4"),
 )
 LEFTOVERS = (TRACKS_PARTIAL, f"{PARTIAL_PREFIX}*{PARTIAL_SUFFIX}")  # of a run that was killed
 

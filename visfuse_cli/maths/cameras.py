@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from visfuse_cli.errors import InputError
@@ -69,6 +71,25 @@ def _focal_length(ground: GroundMap, image_size: tuple[int, int]) -> float:
     cost = np.einsum("fi,fi->f", c, np.linalg.solve(S, c[..., None])[..., 0]) + np.linalg.slogdet(S)[1]
     cost += ((log_f - np.log(FOCAL_PRIOR_WIDTHS * width)) / FOCAL_PRIOR_LOG_SIGMA) ** 2
     return float(np.exp(log_f[np.argmin(cost)]))
+
+
+def raised(camera: GroundCamera, height: float) -> GroundCamera:
+    """The same camera over the plane `height` m above the surveyed one, with X and Y as they are.
+
+    Ground points move towards the camera's foot by height * cot(alpha). Raises ValueError where the camera is not
+    above that plane. Bradshaw 1997, sec. 3.
+    """
+    if height >= camera.centre[2]:
+        raise ValueError(f"the camera is {camera.centre[2]:.1f} m above the ground, and so not above {height:g} m")
+    share = 1 - height / camera.centre[2]
+    shift = np.array([[share, 0, 0], [0, share, 0], [0, 0, 1.0]])
+    shift[:2, 2] = (1 - share) * camera.centre[:2]
+    P = camera.image_from_world.copy()
+    P[:, 3] += height * P[:, 2]
+    entries = np.kron(shift, np.eye(3))  # of d (shift @ H) / d H, row by row
+    ground = camera.ground
+    plane = replace(ground, ground_from_image=shift @ ground.ground_from_image, cov=entries @ ground.cov @ entries.T)
+    return replace(camera, image_from_world=P, ground=plane, centre=camera.centre - [0, 0, height])
 
 
 def project(camera: GroundCamera, points: Array) -> tuple[Array, Array]:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
 import numpy as np
 
 from visfuse_cli.maths.cameras import project
+from visfuse_cli.maths.polygons import Polygon
 from visfuse_cli.maths.speed import KMH
 from visfuse_cli.records import Array, Frame, GroundCamera, Image
 from visfuse_cli.tracking.camera_watch import CameraWatch
@@ -17,6 +18,8 @@ from visfuse_cli.vision.lens import distort_points
 from visfuse_cli.vision.steady import moved
 
 TRAIL_S = 2.0
+PLACE_STEP_M = 1.0
+PALE = (200, 220, 220)
 UNITS = {"km/h": KMH, "mph": 2.2369362920544, "m/s": 1.0}
 
 
@@ -59,10 +62,41 @@ def _on_image(camera: GroundCamera, position: Array) -> Array:
     return pixels if camera.ground.lens is None else distort_points(pixels, camera.ground.lens)
 
 
+class _Place:
+    """A polygon of ground points (k, 2) m with its name, ready to be drawn on every frame."""
+
+    def __init__(self, name: str, polygon: Array, camera: GroundCamera) -> None:
+        ends = np.concatenate([polygon, polygon[:1]])
+        length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(ends, axis=0), axis=1))])
+        places = np.linspace(0, length[-1], max(2, min(400, round(length[-1] / PLACE_STEP_M))))
+        dense = np.column_stack([np.interp(places, length, ends[:, k]) for k in (0, 1)])
+        self._name, self._line = name, _on_image(camera, dense)
+
+    def draw(self, image: Image, image_from_rest: Array) -> None:
+        line = moved(image_from_rest, self._line)
+        size = np.array(image.shape[1::-1])
+        shown = np.asarray(np.isfinite(line).all(axis=1) & (np.abs(line) < 3 * size).all(axis=1))
+        for part in np.split(np.arange(len(line)), np.flatnonzero(np.diff(shown)) + 1):
+            if shown[part[0]]:
+                drawing.polyline(image, line[part], PALE, width=1)
+        inside = line[shown & (line >= 0).all(axis=1) & (line < size).all(axis=1)]
+        if len(inside):
+            drawing.label(image, self._name, inside[np.argmax(inside[:, 1])], PALE, 0.8)
+
+
 def annotate(
-    frames: Iterable[Frame], records: Iterable[dict[str, Any]], camera: GroundCamera, units: str, watch: CameraWatch
+    frames: Iterable[Frame],
+    records: Iterable[dict[str, Any]],
+    camera: GroundCamera,
+    units: str,
+    watch: CameraWatch,
+    places: Mapping[str, Polygon],
 ) -> Iterator[Frame]:
-    """Draw the tracks, given in the order of their first frames, on the frames; only the tracks in view are held."""
+    """Draw the tracks, given in the order of their first frames, on the frames; only the tracks in view are held.
+
+    `places` are polygons on the ground by name: lanes, the region; an empty one is none.
+    """
+    marked = [_Place(name, np.array(polygon), camera) for name, polygon in places.items() if polygon]
     waiting = iter(records)
     upcoming = next(waiting, None)
     active: list[_Drawn] = []
@@ -72,8 +106,11 @@ def annotate(
             upcoming = next(waiting, None)
         active = [drawn for drawn in active if drawn.last >= frame.index]
         motion = watch.image_from_rest(frame.index)
+        here = np.eye(3) if motion is None else motion
+        for place in marked:
+            place.draw(frame.image, here)
         for drawn in active:
-            drawn.draw(frame.image, frame.index, np.eye(3) if motion is None else motion)
+            drawn.draw(frame.image, frame.index, here)
         note = f"{frame.t:.2f} s" + ("  camera moved: not measured" if watch.was_lost(frame.t) else "")
         drawing.label(frame.image, note, np.array([4.0, frame.image.shape[0]]), (230, 230, 230))
         yield frame

@@ -53,6 +53,7 @@ class Path:
     likeness: float  # mean share of the outline that was found
     misfit_px: float
     ended_by: str
+    ahead: Array  # (T, 2) m: where it was expected a latency later, from what was known then
 
 
 def conclude(track: Track, camera: GroundCamera, settings: TrackerSettings, dynamics: Dynamics) -> Path:
@@ -103,7 +104,17 @@ def conclude(track: Track, camera: GroundCamera, settings: TrackerSettings, dyna
         likeness=float(np.nanmean([s.border for s in samples if s.measured])),
         misfit_px=misfit,
         ended_by=track.ended_by,
+        ahead=_ahead(steps, dynamics, settings.latency, float(size[0])),
     )
+
+
+def _ahead(steps: list[Step], dynamics: Dynamics, latency: float, length: float) -> Array:
+    """Positions (T, 2) m that the causal states foretell `latency` s later (Bradshaw 1997, sec. 6)."""
+    if latency == 0:
+        return np.stack([dynamics.planar(step.posterior.mean)[0][:2] for step in steps])
+    every = np.ones(len(steps))
+    foretold = dynamics_tools.predict(dynamics, steps, latency * every, length * every)
+    return np.stack([dynamics.planar(prediction.prior.mean)[0][:2] for prediction in foretold])
 
 
 def _size_z(size: Array, class_name: str, settings: TrackerSettings) -> float:

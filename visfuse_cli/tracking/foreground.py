@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from typing import Literal, Protocol
 
+import cv2
 import numpy as np
 from pydantic import Field
 
 from visfuse_cli.config import Section
+from visfuse_cli.maths.homography import apply
 from visfuse_cli.records import Array, Frame, GroundCamera, Image
 from visfuse_cli.tracking.evidence import BoxEvidence, Evidence, LabelEvidence
+from visfuse_cli.tracking.zones import Region
 from visfuse_cli.vision import regions as region_tools
 from visfuse_cli.vision.background import Background
 from visfuse_cli.vision.lens import distort_points
@@ -53,6 +56,7 @@ class MovingRegions:
         cleaning: RegionSettings,
         smallest_m: float,
         empty: Image,
+        region: Region | None = None,
     ) -> None:
         self._camera = camera
         self._cleaning = cleaning.gap, cleaning.speck, smallest_m
@@ -61,9 +65,13 @@ class MovingRegions:
             background.model, background.threshold, background.shadow_ratio, background.memory_s
         )
         self._background.start(empty)
+        self._watched = None if region is None else region.picture(camera)
 
     def evidence(self, frame: Frame) -> Evidence:
-        return LabelEvidence(self._background.detect(frame.image), self._camera, self._bands, *self._cleaning)
+        labels = self._background.detect(frame.image)
+        if self._watched is not None:
+            labels = np.asarray(cv2.bitwise_and(labels, self._watched), dtype=np.uint8)
+        return LabelEvidence(labels, self._camera, self._bands, *self._cleaning)
 
     def learn(self, frame: Frame, followed: list[Array]) -> None:
         lens = self._camera.ground.lens
@@ -75,8 +83,8 @@ class MovingRegions:
 class Detections:
     """Upright boxes from an external detector: frame -> (n, 5) x, y, w, h px and score."""
 
-    def __init__(self, camera: GroundCamera, boxes: dict[int, Array]) -> None:
-        self._camera, self._boxes = camera, boxes
+    def __init__(self, camera: GroundCamera, boxes: dict[int, Array], region: Region | None = None) -> None:
+        self._camera, self._boxes, self._region = camera, boxes, region
 
     def evidence(self, frame: Frame) -> Evidence:
         rows = self._boxes.get(frame.index, np.zeros((0, 5)))
@@ -88,6 +96,10 @@ class Detections:
         lens = self._camera.ground.lens
         if lens is not None:
             found = [region_tools.undistorted(region, lens) for region in found]
+        if self._region is not None and found:
+            feet = np.array([each.box[:2] + each.box[2:] * [0.5, 1.0] for each in found])
+            near = self._region.near(apply(self._camera.ground.ground_from_image, feet))
+            found = [each for each, kept in zip(found, near, strict=True) if kept]
         return BoxEvidence(found, self._camera)
 
     def learn(self, frame: Frame, followed: list[Array]) -> None:

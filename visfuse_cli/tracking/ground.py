@@ -23,6 +23,7 @@ from visfuse_cli.tracking.joining import WAIT_S
 from visfuse_cli.tracking.lookback import LEAST_OPEN, Recent
 from visfuse_cli.tracking.settings import TrackerSettings
 from visfuse_cli.tracking.targets import Abandoned, Comparison, Sample, Track
+from visfuse_cli.tracking.zones import Region
 from visfuse_cli.vision import wireframe
 
 VAGUE_M = 1.5  # m: a pose less certain than this is no measurement
@@ -50,6 +51,7 @@ class GroundTracker:
         self.tracks: list[Track] = []
         self.next_id = first_id
         self._nursery = Nursery(camera, settings, self.dynamics)
+        self._region = Region(np.array(settings.region)) if settings.region else None
         self._gate = gate_size(len(self.dynamics.H), settings.pose.gate)
         self._t = 0.0
         self._expected: list[Prediction] = []  # of each track, at the predicted time
@@ -234,6 +236,8 @@ class GroundTracker:
                 ended.append(self._trimmed(track, f"same vehicle as track {twin.id}"))
             elif outside[k]:
                 ended.append(self._trimmed(track, "left the picture"))
+            elif self._region is not None and self._left(track, self._region):
+                ended.append(self._trimmed(track, "left the region"))
             elif scale[k] > life.max_scale:
                 ended.append(self._trimmed(track, "left the measurable zone"))
             elif track.likeness < UNLIKE:
@@ -246,6 +250,12 @@ class GroundTracker:
                 alive.append(track)
         self.tracks = alive
         return ended
+
+    def _left(self, track: Track, region: Region) -> bool:
+        """Whether a track has just left the region, or is nowhere near it."""
+        places = np.array([step.posterior.mean[:2] for step in track.steps[-2:]])
+        inside = region.holds(places)
+        return not inside[-1] and bool(inside[0] or not region.near(places[-1]))
 
     def _twin(self, track: Track, pose: Array, others: list[Track]) -> Track | None:
         """An older track in whose footprint this one stands: one vehicle followed twice."""

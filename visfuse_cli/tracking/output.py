@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -17,7 +17,6 @@ from visfuse_cli.vision import wireframe
 from visfuse_cli.vision.lens import distort_points
 from visfuse_cli.vision.steady import moved
 
-Polygon = tuple[tuple[float, float], ...]  # corners on the ground, m
 COLUMNS = (
     "clip",
     "track_id",
@@ -48,6 +47,7 @@ def track_record(
     camera: GroundCamera,
     clip: str | None,
     image_from_rest: Callable[[int], Array | None],
+    latency: float,
 ) -> dict[str, Any]:
     """One track of tracks.json; `image_from_rest` tells where the camera looked in a frame."""
     mean, cov = path.planar.mean, path.planar.cov
@@ -80,6 +80,9 @@ def track_record(
         }
         for k in range(len(mean))
     ]
+    if latency > 0:
+        for k, state in enumerate(record["states"]):
+            state["ahead"] = {"t": float(path.t[k] + latency), "position": path.ahead[k].tolist()}
     return record
 
 
@@ -105,8 +108,8 @@ def _degrees(course: float) -> float:
     return float(np.degrees(course) % 360)
 
 
-def row_of(path: Path, verdict: Verdict, clip: str, time_utc: str, lane: int | None) -> dict[str, Any]:
-    """One row of speeds.csv (or, with a reason, of rejected.csv)."""
+def row_of(path: Path, verdict: Verdict, clip: str, time_utc: str) -> dict[str, Any]:
+    """One row of speeds.csv (or, with a reason, of rejected.csv); lanes are told when all tracks are known."""
     return {
         "clip": clip,
         "track_id": path.id,
@@ -114,7 +117,7 @@ def row_of(path: Path, verdict: Verdict, clip: str, time_utc: str, lane: int | N
         "t_end": f"{path.t[verdict.last]:.3f}",
         "time_utc": time_utc,
         "direction": f"{_degrees(verdict.course):.1f}",
-        "lane": "" if lane is None else lane,
+        "lane": "",
         "speed_kmh": f"{verdict.speed * KMH:.2f}",
         "ci95_low_kmh": f"{(verdict.speed - Z95 * verdict.sigma) * KMH:.2f}",
         "ci95_high_kmh": f"{(verdict.speed + Z95 * verdict.sigma) * KMH:.2f}",
@@ -134,16 +137,3 @@ def abandoned_row(abandoned: Abandoned, clip: str, time_utc: str) -> dict[str, A
         "n_frames": abandoned.n_frames,
         "reason": abandoned.reason,
     }
-
-
-def lane_of(position: Array, lanes: Sequence[Polygon]) -> int | None:
-    """The number (from 1) of the first lane polygon (k, 2) m that holds a ground point (2,), or None."""
-    for number, polygon in enumerate(lanes, start=1):
-        x, y = np.transpose(polygon)
-        x2, y2 = np.roll(x, -1), np.roll(y, -1)
-        crosses = (y > position[1]) != (y2 > position[1])
-        with np.errstate(divide="ignore", invalid="ignore"):
-            left = position[0] < (x2 - x) * (position[1] - y) / (y2 - y) + x
-        if int(np.sum(crosses & left)) % 2:
-            return number
-    return None

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from typing import Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from visfuse_cli.config import Section
+from visfuse_cli.maths.polygons import Polygon, surrounding
 
 
 class SizePrior(Section):
@@ -45,6 +46,9 @@ class TargetSettings(Section):
         VEHICLES, min_length=1, description="size priors; each track takes the class that explains its outline best"
     )
     smallest: float = Field(0.5, gt=0, le=10, description="m: regions smaller than this in both directions are ignored")
+    height: float = Field(
+        0.0, ge=-100, le=1000, description="m: how far above the surveyed plane the plane lies that targets stand on"
+    )
 
 
 class PoseSettings(Section):
@@ -111,3 +115,10 @@ class TrackerSettings(Section):
     filter: FilterSettings = FilterSettings()
     life: LifeSettings = LifeSettings()
     smooth: bool = Field(True, description="true: a backward pass over each whole track; false: causal output")
+    latency: float = Field(0.0, ge=0, le=10, description="s: every state is also predicted this far ahead")
+    region: Polygon = Field((), description="polygon of ground points [X, Y] m outside of which nothing is tracked")
+
+    @field_validator("region")
+    @classmethod
+    def _surrounds(cls, region: Polygon) -> Polygon:
+        return region and surrounding(region, "region")

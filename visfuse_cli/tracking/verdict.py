@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field
 from scipy.ndimage import maximum_filter1d
 
@@ -35,6 +36,9 @@ class SpeedSettings(Section):
     max_refused: float = Field(
         0.5, gt=0, le=1, description="share of measurements outside the gate: above, inconsistent"
     )
+    max_calibration: float = Field(
+        0.1, gt=0, le=10, description="trusted zone: deviation of 50 km/h over a second that calibration may cause"
+    )
     sigma_t_s: float = Field(0.0005, ge=0, le=1, description="s: noise of one time stamp")
 
 
@@ -51,11 +55,12 @@ class Verdict:
     reason: str
 
 
-def judge(path: Path, entry_cov: Array, bias_px: float, settings: SpeedSettings) -> Verdict:
+def judge(path: Path, entry_cov: Array, bias_px: float, settings: SpeedSettings, trusted: NDArray[np.bool_]) -> Verdict:
     """Measure the mean speed over the longest stretch on which it is known well, and test the track.
 
     The stretch's ends may lie anywhere on the measured path; pose noise counts less with length, calibration doubt
-    grows away from the surveyed points. Well known is a doubt of GOOD_ENOUGH, or LONGER_FOR times the least.
+    grows away from the surveyed points; `trusted` (T,) tells where the calibration holds. Well known is a doubt of
+    GOOD_ENOUGH, or LONGER_FOR times the least.
     """
     position, velocity = path.planar.mean[:, :2], path.planar.mean[:, 2:]
     tangent = velocity / np.maximum(np.linalg.norm(velocity, axis=1, keepdims=True), 1e-6)
@@ -67,7 +72,7 @@ def judge(path: Path, entry_cov: Array, bias_px: float, settings: SpeedSettings)
     moved = position[last] - position[first]
     course = float(np.arctan2(moved[1], moved[0]))
     verdict = Verdict(first, last, float(speed), float(sigma), float(distance), course, "")
-    return replace(verdict, reason=_reason(path, verdict, settings))
+    return replace(verdict, reason=_reason(path, verdict, settings, bool((trusted & path.measured).any())))
 
 
 def _best_stretch(
@@ -107,7 +112,7 @@ def _best_stretch(
     return int(i[best]), int(j[best]), float(sigma_way[best] / max(duration[best], 1e-9))
 
 
-def _reason(path: Path, verdict: Verdict, settings: SpeedSettings) -> str:
+def _reason(path: Path, verdict: Verdict, settings: SpeedSettings, trusted: bool) -> str:
     """Why this track gets no speed; empty when it does. Nothing is clamped: a track is believed or rejected."""
     duration = path.t[verdict.last] - path.t[verdict.first]
     frames = int(path.measured[verdict.first : verdict.last + 1].sum())
@@ -115,6 +120,8 @@ def _reason(path: Path, verdict: Verdict, settings: SpeedSettings) -> str:
     refused = path.refused / max(1, path.refused + int(path.measured.sum()))
     if path.ended_by.startswith("same vehicle"):
         return path.ended_by
+    if not trusted:
+        return "outside the trusted zone"
     if frames < settings.min_frames or duration < settings.min_duration_s:
         return f"too short: {frames} measured frames over {duration:.2f} s"
     if verdict.distance < settings.min_distance_m:
@@ -133,7 +140,7 @@ def _reason(path: Path, verdict: Verdict, settings: SpeedSettings) -> str:
         return f"no box fits: outline off by {path.misfit_px:.0f} px (several vehicles, a shadow or a reflection)"
     if verdict.sigma > settings.max_sigma * abs(verdict.speed):
         half = verdict.sigma * Z95 * KMH
-        return f"too uncertain: {verdict.speed * KMH:.0f} +- {half:.0f} km/h, outside the trusted zone"
+        return f"too uncertain: {verdict.speed * KMH:.0f} +- {half:.0f} km/h"
     return ""
 
 

@@ -1,0 +1,135 @@
+"""Places on the ground: polygons, the region of interest, the trusted zone, a plane above the surveyed one."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from masks import CAR, drive, evidence_of, labels_of, road_camera
+
+from visfuse_cli.maths.cameras import elevation, project, raised
+from visfuse_cli.maths.homography import apply
+from visfuse_cli.maths.polygons import area, contains, distance, surrounding
+from visfuse_cli.tracking.conclude import conclude
+from visfuse_cli.tracking.ground import GroundTracker
+from visfuse_cli.tracking.settings import TrackerSettings
+from visfuse_cli.tracking.verdict import SpeedSettings, judge
+from visfuse_cli.tracking.zones import Region, trusted
+
+CAMERA = road_camera()
+ELL = np.array([[0.0, 0], [4, 0], [4, 1], [1, 1], [1, 3], [0, 3]])
+
+
+def test_a_concave_polygon():
+    points = np.array([[0.5, 0.5], [3.5, 0.5], [0.5, 2.5], [2, 2], [5, 0.5], [-1, 1]])
+    assert contains(ELL, points).tolist() == [True, True, True, False, False, False]
+    assert contains(ELL[::-1], points).tolist() == contains(ELL, points).tolist()
+    np.testing.assert_allclose(distance(ELL, points)[[3, 4, 5]], [1, 1, 1])
+    assert area(ELL) == pytest.approx(6)
+
+
+@pytest.mark.parametrize("corners", [((0, 0), (1, 1)), ((0, 0), (1, 1), (2, 2))])
+def test_what_surrounds_nothing_is_no_polygon(corners):
+    with pytest.raises(ValueError, match="the yard"):
+        surrounding(corners, "the yard")
+
+
+@pytest.mark.parametrize("height", [-1.0, 0.0, 2.5])
+def test_a_raised_plane_sees_its_points_where_they_are(height):
+    ground = np.array([[4.0, 25.0], [-3, 40], [0, 15]])
+    camera = raised(CAMERA, height)
+    pixels, _ = project(CAMERA, np.column_stack([ground, np.full(3, height)]))
+    np.testing.assert_allclose(apply(camera.ground.ground_from_image, pixels), ground, atol=0.05)
+    np.testing.assert_allclose(project(camera, np.column_stack([ground, np.zeros(3)]))[0], pixels, atol=1e-6)
+    seen_at = apply(CAMERA.ground.ground_from_image, pixels)
+    mapped = apply(camera.ground.ground_from_image, pixels)
+    np.testing.assert_allclose(mapped, elevation(CAMERA, seen_at, height), atol=1e-9)
+
+
+def test_a_raised_plane_keeps_the_doubt_of_its_points():
+    rng = np.random.default_rng(4)
+    half = rng.normal(0, 1e-7, (9, 9))
+    ground = replace(CAMERA.ground, cov=half @ half.T)
+    doubted = replace(CAMERA, ground=ground)
+    plain, high = (raised(doubted, h).ground.cov for h in (0.0, 3.5))
+    share = 1 - 3.5 / CAMERA.centre[2]
+    np.testing.assert_allclose(plain, ground.cov)
+    np.testing.assert_allclose(high[6:, 6:], ground.cov[6:, 6:])
+    shift = np.array(
+        [[share, 0, (1 - share) * CAMERA.centre[0]], [0, share, (1 - share) * CAMERA.centre[1]], [0, 0, 1]]
+    )
+    entries = half.reshape(3, 3, 9).transpose(2, 0, 1) * 1.0
+    sampled = sum(np.outer((shift @ e).ravel(), (shift @ e).ravel()) for e in entries)
+    np.testing.assert_allclose(high, sampled)
+
+
+def test_no_plane_lies_above_the_camera():
+    with pytest.raises(ValueError, match="not above"):
+        raised(CAMERA, CAMERA.centre[2] + 1)
+
+
+def follow(truth, settings):
+    tracker = GroundTracker(CAMERA, settings)
+    tracks = []
+    for k, pose in enumerate(truth):
+        tracker.predict(k / 25)
+        tracks += tracker.update(k, evidence_of(CAMERA, labels_of(CAMERA, [(pose, CAR)])))[0]
+    return tracker, tracks + tracker.finish()[0]
+
+
+@pytest.fixture(scope="module")
+def passing():
+    truth = drive((-1, 14), (0.4, 9), np.arange(80) / 25)
+    square = ((-20, 20), (20, 20), (20, 32), (-20, 32))
+    settings = TrackerSettings(region=square)
+    tracker, tracks = follow(truth, settings)
+    return square, settings, tracker, tracks
+
+
+def test_nothing_outside_of_the_region_is_tracked(passing):
+    square, settings, tracker, tracks = passing
+    (track,) = tracks
+    assert track.ended_by == "left the region"
+    path = Region(np.array(square)).part(conclude(track, CAMERA, settings, tracker.dynamics))
+    assert path is not None
+    assert contains(np.array(square), path.planar.mean[:, :2]).all()
+    assert np.ptp(path.planar.mean[:, 1]) > 10
+    assert len(path.t) == len(path.frame) == len(path.planar.cov) == len(path.ahead)
+    elsewhere = Region(np.array([[50.0, 50], [60, 50], [60, 60]]))
+    assert elsewhere.part(path) is None
+
+
+def test_the_regions_picture_shows_what_stands_in_it_and_little_more():
+    region = Region(np.array([[-2.0, 20], [2, 20], [2, 30], [-2, 30]]))
+    mask = region.picture(CAMERA)
+    assert mask.shape == CAMERA.image_size[::-1]
+    for place, height, shown in (((0, 25), 0, True), ((0, 25), 3.5, True), ((15, 25), 0, False), ((0, 110), 0, False)):
+        (u, v), _ = project(CAMERA, np.array([*place, height], dtype=float))
+        assert (mask[round(v), round(u)] > 0) == shown
+
+
+def test_the_trusted_zone_ends_where_the_calibration_does():
+    assert trusted(CAMERA, np.array([[0.0, 25], [0, 30]]), 1.0, 0.1).all()
+    bad = replace(CAMERA.ground, cov=np.diag([0, 0, 0, 0, 0, 0, 1e-7, 1e-7, 0.0]))
+    zone = trusted(replace(CAMERA, ground=bad), np.array([[0.0, 12], [0, 70]]), 1.0, 0.1)
+    assert zone.tolist() == [True, False]
+
+
+def test_a_track_outside_the_trusted_zone_is_rejected_with_that_reason(passing):
+    _, settings, tracker, (track,) = passing
+    path = conclude(track, CAMERA, settings, tracker.dynamics)
+    verdicts = [
+        judge(path, CAMERA.ground.cov, 1.0, SpeedSettings(), np.full(len(path.t), zone)).reason
+        for zone in (True, False)
+    ]
+    assert verdicts == ["", "outside the trusted zone"]
+
+
+def test_positions_ahead_are_where_the_car_is_then():
+    truth = drive((-1, 14), (0.4, 9), np.arange(80) / 25)
+    for settings in (TrackerSettings(latency=0.4), TrackerSettings(latency=0.4, smooth=False)):
+        tracker, (track,) = follow(truth, settings)
+        path = conclude(track, CAMERA, settings, tracker.dynamics)
+        late = path.frame + 10
+        known = (late < len(truth)) & (np.arange(len(late)) > 12)
+        error = np.linalg.norm(path.ahead[known] - truth[late[known], :2], axis=1)
+        assert np.median(error) < 0.4
