@@ -26,6 +26,10 @@ def calibrate_homography(
     gaze: Annotated[
         Path | None, typer.Option("--gaze", metavar="F", help="CSV elevation,vergence,X,Y: pan-tilt angles (rad).")
     ] = None,
+    pick: Annotated[
+        Path | None,
+        typer.Option("--pick", metavar="CLIP", help="Click points or lines on a frame, on a page in your browser."),
+    ] = None,
     image: Annotated[
         Path | None, typer.Option("--image", metavar="F", help="A frame or clip: draws the picture beside H.json.")
     ] = None,
@@ -41,6 +45,9 @@ def calibrate_homography(
     origin: Annotated[
         str | None, typer.Option("--origin", metavar="E,N", help="What was taken off X and Y; with --crs.")
     ] = None,
+    port: Annotated[
+        int, typer.Option("--port", metavar="N", min=0, max=65535, help="Of the page of --pick; 0: any free one.")
+    ] = 0,
     config: ConfigOption = None,
     set_: SetOption = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace H.json.")] = False,
@@ -50,15 +57,19 @@ def calibrate_homography(
     """Image (or pan-tilt angles) to ground plane, from points or lines.
 
     Example: visfuse calibrate-homography --points points.csv --image clip.mp4 --out H.json
+
+    Example: visfuse calibrate-homography --pick clip.mp4 --out H.json
     """
     from visfuse_cli.commands import calibrate_homography as command
     from visfuse_cli.files.ground_reference import parse_reference
     from visfuse_cli.records import RunRequest
 
-    sources = {"points": points, "lines": lines, "gaze": gaze}
+    sources = {"points": points, "lines": lines, "gaze": gaze, "pick": pick}
     given = [name for name, path in sources.items() if path is not None]
     if len(given) != 1:
-        raise UsageError(f"give exactly one of --points, --lines and --gaze, not {len(given)}")
+        raise UsageError(f"give exactly one of --points, --lines, --gaze and --pick, not {len(given)}")
+    if pick is not None and (image or size):
+        raise UsageError("--pick shows its own clip: --image and --size go with --points, --lines and --gaze")
     request = RunRequest(
         command="calibrate-homography",
         input=next(path for path in sources.values() if path is not None),
@@ -69,7 +80,12 @@ def calibrate_homography(
         overwrite=overwrite,
         argv=tuple(sys.argv),
     )
-    tell(command.run(request), command.text, as_json, quiet)
+    if pick is not None:
+        from visfuse_cli.apps import picker
+
+        tell(picker.run(request, port), picker.text, as_json, quiet)
+    else:
+        tell(command.run(request), command.text, as_json, quiet)
 
 
 def _size(text: str | None) -> tuple[int, int] | None:

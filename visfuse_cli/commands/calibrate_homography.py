@@ -6,7 +6,7 @@ table -> (undistort, snap) -> fit -> ground map -> H.json, picture, summary
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -20,7 +20,7 @@ from visfuse_cli.files import homography as homography_files
 from visfuse_cli.files.atomic import replacing
 from visfuse_cli.files.calibration_input import read_gaze, read_lines, read_points
 from visfuse_cli.files.lens_files import read_lens
-from visfuse_cli.files.video import open_source
+from visfuse_cli.files.stills import Stills
 from visfuse_cli.maths import gaze
 from visfuse_cli.maths.calibration_error import speed_error
 from visfuse_cli.maths.homography_fit import Fit, fit_points
@@ -93,73 +93,72 @@ class Survey:
     world: Array
     fit: Fit
     warnings: tuple[str, ...] = ()
+    input: str = "pixel"
 
 
 def run(request: RunRequest) -> RunResult:
     """Fit the homography and write it with its picture; raises InputError for input that cannot carry one."""
     config: CalibrateConfig = request.config
     options = request.options
-    picture_path = request.out.with_suffix(".png") if options.get("image") and not options.get("gaze") else None
-    _check_output(request, picture_path)
+    drawable = options.get("image") and not options.get("gaze")
+    check_output(request, (request.out.with_suffix(".png"),) if drawable else ())
     lens, lens_size = read_lens(options["camera"]) if options.get("camera") else (None, None)
-    image = _read_image(options["image"]) if options.get("image") else None
+    image = Stills(options["image"]).at(0.0)[1] if options.get("image") else None
     size = _agreed_size(image, options, lens_size)
     survey = _survey(options, config, image, lens)
-    ground = GroundMap(
+    ground = ground_map(request, survey, size, lens, request.input.name)
+    return write(request, survey, ground, image if drawable else None)
+
+
+def ground_map(request: RunRequest, survey: Survey, size: Size | None, lens: Lens | None, source: str) -> GroundMap:
+    """What a survey says about the ground before a camera of that size and lens."""
+    return GroundMap(
         ground_from_image=survey.fit.H,
         cov=survey.fit.cov,
         ground_sign=survey.fit.ground_sign,
-        input="gaze" if options.get("gaze") else "pixel",
+        input=survey.input,
         image_size=size,
         lens=lens,
         rms_m=survey.fit.rms_m,
         rms_px=survey.fit.rms_px,
         residuals=_residuals(survey.fit),
-        source=request.input.name,
-        reference=options.get("reference"),
+        source=source,
+        reference=request.options.get("reference"),
     )
-    picture = b""
-    if image is not None and picture_path is not None:
+
+
+def write(request: RunRequest, survey: Survey, ground: GroundMap, image: Image | None) -> RunResult:
+    """Write H.json, and over `image` the picture beside it; the summary tells what to think of them."""
+    config, picture = request.config, None
+    if image is not None:
         drawn = draw(image, ground, survey.marks, survey.world, survey.fit.used, config.noise.sigma_px)
-        picture = cv2.imencode(".png", drawn)[1].tobytes()
+        picture = request.out.with_suffix(".png")
+        encoded = cv2.imencode(".png", drawn)[1].tobytes()
     homography_files.write(request.out, ground)
-    if picture_path is not None:
-        with replacing(picture_path) as file:
-            file.write(picture)
-    warnings = (*survey.warnings, *_doubts(survey, size if ground.input == "pixel" else None, config))
-    return RunResult(request.out, _summary(request, ground, survey, picture_path, warnings), warnings)
+    if picture is not None:
+        with replacing(picture) as file:
+            file.write(encoded)
+    warnings = (*survey.warnings, *doubts(survey, ground.image_size, config))
+    return RunResult(request.out, _summary(request, ground, survey, picture, warnings), warnings)
 
 
-def _check_output(request: RunRequest, picture: Path | None) -> None:
+def check_output(request: RunRequest, beside: tuple[Path, ...]) -> None:
+    """Raise OutputError where H.json, or a file beside it, cannot be written or would replace something."""
     out = request.out
     if out.is_dir():
         raise OutputError(f"{out}: is a folder; give --out the name of a file, like H.json")
     if not out.parent.is_dir():
         raise OutputError(f"{out.parent}: no such folder")
-    if picture == out:
-        raise OutputError(f"{out}: the picture beside it would take its name; give --out a name that ends in .json")
+    if out in beside:
+        raise OutputError(f"{out}: a file beside it would take its name; give --out a name that ends in .json")
     inputs = [path for path in request.options.values() if isinstance(path, Path)]
-    for path in (out, picture):
-        if path is None or not path.exists():
+    for path in (out, *beside):
+        if not path.exists():
             continue
         if any(given.exists() and path.samefile(given) for given in inputs):
             raise OutputError(f"{path}: is an input and would be overwritten; give --out another name")
         if not request.overwrite:
             raise OutputError(f"{path}: exists; give --overwrite or another name")
-
-
-def _read_image(path: Path) -> Image:
-    """A picture, or the first frame of a clip, as 8-bit BGR."""
-    try:
-        image = cv2.imread(str(path), cv2.IMREAD_COLOR) if path.is_file() and cv2.haveImageReader(str(path)) else None
-    except cv2.error as problem:
-        raise InputError(f"{path}: not a readable picture") from problem
-    if image is not None:
-        return np.asarray(image, dtype=np.uint8)
-    with open_source(path, fps=1.0) as source:
-        for frame in source.frames():
-            return frame.image
-    raise InputError(f"{path}: holds no frame")
 
 
 def _agreed_size(image: Image | None, options: dict[str, Any], lens_size: Size | None) -> Size | None:
@@ -183,9 +182,19 @@ def _survey(options: dict[str, Any], config: CalibrateConfig, image: Image | Non
     if options.get("lines"):
         return _from_lines(options["lines"], config, image, lens)
     path: Path = options["points"]
-    marks, world = read_points(path)
+    return from_points(*read_points(path), config, lens, path)
+
+
+def from_points(marks: Array, world: Array, config: CalibrateConfig, lens: Lens | None, path: Path) -> Survey:
+    """The homography through points (N, 2) px and (N, 2) m; raises InputError that names `path`."""
     straight = _straightened(path, marks, lens)
     return Survey("point", marks, world, _named(path, lambda: fit_points(straight, world, *_fitting(config))))
+
+
+def from_lines(marks: Array, world: Array, config: CalibrateConfig, lens: Lens | None, path: Path) -> Survey:
+    """The homography through lines (N, 4) px and (N, 4) m; raises InputError that names `path`."""
+    straight = _straightened(path, marks.reshape(-1, 2), lens).reshape(-1, 4)
+    return Survey("line", marks, world, _named(path, lambda: fit_lines(straight, world, *_fitting(config))))
 
 
 def _from_lines(path: Path, config: CalibrateConfig, image: Image | None, lens: Lens | None) -> Survey:
@@ -196,8 +205,7 @@ def _from_lines(path: Path, config: CalibrateConfig, image: Image | None, lens: 
             raise UsageError("snap.enabled needs --image: lines are moved onto the edges of a picture")
         marks, snapped = snap(image, marks, config.snap.radius_px)
         warnings = tuple(f"line {k + 1} has no edge under it and stays as drawn" for k in np.flatnonzero(~snapped))
-    straight = _straightened(path, marks.reshape(-1, 2), lens).reshape(-1, 4)
-    return Survey("line", marks, world, _named(path, lambda: fit_lines(straight, world, *_fitting(config))), warnings)
+    return replace(from_lines(marks, world, config, lens, path), warnings=warnings)
 
 
 def _from_gaze(path: Path, config: CalibrateConfig) -> Survey:
@@ -211,7 +219,7 @@ def _from_gaze(path: Path, config: CalibrateConfig) -> Survey:
     def fit() -> Fit:
         return fit_points(marks, world, config.noise.sigma_rad, robust, config.limits.condition, measured)
 
-    return Survey("point", marks, world, _named(path, fit))
+    return Survey("point", marks, world, _named(path, fit), input="gaze")
 
 
 def _straightened(path: Path, marks: Array, lens: Lens | None) -> Array:
@@ -241,32 +249,32 @@ def _named(path: Path, fit: Callable[[], Fit]) -> Fit:
         raise InputError(f"{path}: this input does not determine a homography ({problem})") from problem
 
 
-def _doubts(survey: Survey, size: Size | None, config: CalibrateConfig) -> list[str]:
+def doubts(survey: Survey, size: Size | None, config: CalibrateConfig) -> list[str]:
     """What a person should know before trusting this calibration."""
-    noun, fit, doubts = survey.noun, survey.fit, []
+    noun, fit, found = survey.noun, survey.fit, list[str]()
     for k in map(int, np.flatnonzero(~fit.used)):
-        doubts.append(
+        found.append(
             f"{noun} {k + 1} disagrees with the others by {fit.error_m[k]:.1f} m on the ground and was dropped"
         )
     if fit.used.sum() < FEW:
-        doubts.append(f"{int(fit.used.sum())} {noun}s leave little to check them with; six or more are better")
+        found.append(f"{int(fit.used.sum())} {noun}s leave little to check them with; six or more are better")
     for k in map(int, np.flatnonzero(fit.leave_one_out_m > config.limits.leave_one_out_m)):
-        doubts.append(
+        found.append(
             f"leaving out {noun} {k + 1} moves it by {fit.leave_one_out_m[k]:.1f} m: the calibration hangs on it"
         )
     ground = survey.world.reshape(-1, 2)
     far, extent = float(np.abs(ground).max()), float(np.ptp(ground, axis=0).max())
     if far > FAR * extent:
-        doubts.append(
+        found.append(
             f"the ground points lie {far / 1000:.0f} km from their origin, too far for the covariance's digits; "
             "subtract a constant from X and Y"
         )
-    if size is not None:
+    if size is not None and survey.input == "pixel":
         for k, mark in enumerate(survey.marks):
             ends = mark.reshape(-1, 2)
             if np.any((ends < -0.5) | (ends > np.array(size) - 0.5)):
-                doubts.append(f"{noun} {k + 1} lies outside the {size[0]}x{size[1]} image")
-    return doubts
+                found.append(f"{noun} {k + 1} lies outside the {size[0]}x{size[1]} image")
+    return found
 
 
 def _residuals(fit: Fit) -> tuple[dict[str, Any], ...]:
@@ -306,10 +314,15 @@ def _summary(
         "warnings": list(warnings),
     }
     if ground.input == "pixel":
-        marks = survey.marks[fit.used].reshape(-1, 2).mean(axis=0, keepdims=True)
-        centre = marks if ground.lens is None else undistort_points(marks, ground.lens)
-        summary["speed_sigma_kmh"] = _finite(speed_error(ground, centre, request.config.noise.sigma_px)[0])
+        summary["speed_sigma_kmh"] = speed_sigma(survey, ground, request.config)
     return summary
+
+
+def speed_sigma(survey: Survey, ground: GroundMap, config: CalibrateConfig) -> float | None:
+    """Standard deviation (km/h) to expect of 50 km/h over one second in the middle of the survey."""
+    marks = survey.marks[survey.fit.used].reshape(-1, 2).mean(axis=0, keepdims=True)
+    centre = marks if ground.lens is None else undistort_points(marks, ground.lens)
+    return _finite(speed_error(ground, centre, config.noise.sigma_px)[0])
 
 
 def text(result: RunResult) -> str:

@@ -1,4 +1,4 @@
-"""points.csv, lines.csv and gaze.csv: strict, with line and column in every complaint."""
+"""points.csv, lines.csv and gaze.csv: read strictly, with line and column in every complaint."""
 
 from __future__ import annotations
 
@@ -11,22 +11,25 @@ from pathlib import Path
 import numpy as np
 
 from visfuse_cli.errors import InputError
+from visfuse_cli.files.atomic import write_text
 from visfuse_cli.records import Array
 
 LARGEST = 1_000_000  # bytes; a survey is small, and rubbish is not read to its end
 BEYOND = 1e9  # no pixel and no metre on Earth is that far
+POINT_COLUMNS = ("u", "v", "X", "Y")
+LINE_COLUMNS = ("u1", "v1", "u2", "v2", "X1", "Y1", "X2", "Y2")
 NUMBER = re.compile(r"[-+]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][-+]?[0-9]+)?|[-+]?(nan|inf|infinity)", re.IGNORECASE)
 
 
 def read_points(path: Path) -> tuple[Array, Array]:
     """Image points (N, 2) px and ground points (N, 2) m of `u,v,X,Y`; raises InputError."""
-    table = _read(path, ("u", "v", "X", "Y"))
+    table = _read(path, POINT_COLUMNS)
     return table[:, :2], table[:, 2:]
 
 
 def read_lines(path: Path) -> tuple[Array, Array]:
     """Image lines (N, 4) px and ground lines (N, 4) m of `u1,v1,u2,v2,X1,Y1,X2,Y2`; raises InputError."""
-    table = _read(path, ("u1", "v1", "u2", "v2", "X1", "Y1", "X2", "Y2"))
+    table = _read(path, LINE_COLUMNS)
     return table[:, :4], table[:, 4:]
 
 
@@ -34,6 +37,12 @@ def read_gaze(path: Path) -> tuple[Array, Array]:
     """Elevation and vergence (N, 2) rad and ground points (N, 2) m of `elevation,vergence,X,Y`; raises InputError."""
     table = _read(path, ("elevation", "vergence", "X", "Y"), angles=2)
     return table[:, :2], table[:, 2:]
+
+
+def write_survey(path: Path, columns: tuple[str, ...], table: Array) -> None:
+    """Write points or lines (N, len(columns)) so that they are read back to the last digit; raises OutputError."""
+    rows = [",".join(repr(value) for value in row) for row in table.tolist()]
+    write_text(path, "\n".join([",".join(columns), *rows]) + "\n")
 
 
 def _read(path: Path, names: tuple[str, ...], angles: int = 0) -> Array:

@@ -27,6 +27,7 @@ FULL_RANGE = 2  # AVColorRange JPEG
 NO_TIMESTAMPS = 0x80  # AVFMT_NOTIMESTAMPS
 CLOCK_SET = 1980  # a clock that was never set says 1904 or 1970
 MAX_READ_FAILURES = 8
+RIGHT_THEN = 1e-6  # s: a stamp and the same stamp as text
 TURNS = {90: cv2.ROTATE_90_COUNTERCLOCKWISE, 180: cv2.ROTATE_180, 270: cv2.ROTATE_90_CLOCKWISE}
 
 
@@ -87,6 +88,22 @@ class Clip:
         if interlaced:
             auditor.warn(f"{plural(interlaced, 'frame')} interlaced: odd and even rows show two instants")
         self._note_losses(auditor, index + 1, t, longest)
+
+    def still(self, t: float) -> tuple[float, _Picture]:
+        """The picture that is shown at `t` (s) and its own time, found from the key frame before it."""
+        for seeking in (self._stamped and t > 0, False):
+            with self._opened() as (container, stream):
+                if seeking:
+                    container.seek(self._first_pts + int(t / self._tick), stream=stream)
+                shown: tuple[float, av.VideoFrame] | None = None
+                for index, frame in enumerate(_decoded(container, stream, TimeAuditor(self.path.name))):
+                    when = self._time(frame, index, shown[0] if shown else -float(self._interval))
+                    if when > t + RIGHT_THEN and (shown or seeking):
+                        break
+                    shown = (when, frame)
+                if shown is not None:
+                    return shown[0], _picture(shown[1], self._buffer(), self._turn)
+        raise InputError(f"{self.path}: no frame at {t:g} s can be decoded")
 
     def _time(self, frame: av.VideoFrame, index: int, before: float) -> float:
         """Seconds since the first stamp; a frame without one follows the frame before by the stated interval."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from itertools import pairwise
 
 import cv2
@@ -33,13 +34,13 @@ def draw(
     out = _error_colours(image, ground, sigma_px)
     _grid(out, ground, world.reshape(-1, 2))
     for index, mark in enumerate(marks):
-        mapped = _to_image(ground, world[index].reshape(-1, 2))
+        mapped = to_image(ground, world[index].reshape(-1, 2))
         _mark(out, index, mark.reshape(-1, 2), mapped, bool(used[index]))
     _legend(out, sigma_px)
     return out
 
 
-def _to_image(ground: GroundMap, world: Array) -> Array:
+def to_image(ground: GroundMap, world: Array) -> Array:
     """Ground points (N, 2) m to the footage's pixels; NaN beyond the horizon."""
     with np.errstate(all="ignore"):
         pixels = apply(invert(ground.ground_from_image), world)
@@ -53,17 +54,26 @@ def _to_image(ground: GroundMap, world: Array) -> Array:
     return pixels
 
 
-def _error_colours(image: Image, ground: GroundMap, sigma_px: float) -> Image:
-    """The frame tinted by the expected error, with the levels' borders; dark above the horizon."""
-    height, width = image.shape[:2]
-    step = max(1, height // 180)
+def error_field(ground: GroundMap, size: tuple[int, int], step: int, sigma_px: float) -> Array:
+    """Standard deviation (h, w) km/h of 50 km/h over one second at every step-th pixel of a picture of size (w, h).
+
+    The last row and column lie on the picture's border; NaN above the horizon.
+    """
+    width, height = size
     v, u = np.mgrid[0 : height + step : step, 0 : width + step : step]
     pixels = np.column_stack([np.minimum(u.ravel(), width - 1), np.minimum(v.ravel(), height - 1)]).astype(float)
     if ground.lens is not None:
         pixels = undistort_points(pixels, ground.lens)
-    error = speed_error(ground, pixels, sigma_px).reshape(u.shape)
-    known = _enlarged(np.isfinite(error).astype(np.float32), step, image) > 0.5
-    error = _enlarged(np.nan_to_num(np.log(error), nan=9.0).astype(np.float32), step, image)
+    return speed_error(ground, pixels, sigma_px).reshape(u.shape)
+
+
+def _error_colours(image: Image, ground: GroundMap, sigma_px: float) -> Image:
+    """The frame tinted by the expected error, with the levels' borders; dark above the horizon."""
+    height, width = image.shape[:2]
+    step = max(1, height // 180)
+    field = error_field(ground, (width, height), step, sigma_px)
+    known = _enlarged(np.isfinite(field).astype(np.float32), step, image) > 0.5
+    error = _enlarged(np.nan_to_num(np.log(field), nan=9.0).astype(np.float32), step, image)
     level = np.searchsorted(np.log(LEVELS), error).astype(np.uint8)
     colours = np.array(COLOURS, dtype=np.uint8)[level]
     out = (image * (1 - TINT) + colours * TINT).astype(np.uint8)
@@ -81,24 +91,43 @@ def _enlarged(coarse: NDArray[np.float32], step: int, image: Image) -> NDArray[n
     return np.asarray(cv2.warpAffine(coarse, shrink, (width, height), flags=flags), dtype=np.float32)
 
 
-def _grid(out: Image, ground: GroundMap, world: Array) -> None:
-    """Lines of equal X and Y over the surveyed area and half as much around it, each with its metres."""
+def grid_lines(ground: GroundMap, world: Array, size: tuple[int, int]) -> Iterator[tuple[int, float, list[Array]]]:
+    """Lines of equal X (axis 0) and Y (axis 1) over the surveyed area and half as much around it, with their metres.
+
+    Each comes as the pieces (k, 2) px of it that may be seen in a picture of size (w, h).
+    """
     low, high = world.min(axis=0), world.max(axis=0)
     margin = 0.5 * (high - low).max()
     raw = ((high - low).max() + 2 * margin) / 12
     spacing = next(m * 10.0**e for e in range(-6, 12) for m in (1, 2, 5) if m * 10.0**e >= raw)
     low, high = np.floor((low - margin) / spacing), np.ceil((high + margin) / spacing)
-    labels: list[tuple[str, Array]] = []
     for axis in (0, 1):
         for number in np.arange(low[axis], high[axis] + 1):
             other = np.linspace(low[1 - axis], high[1 - axis], 200) * spacing
             line = np.empty((len(other), 2))
             line[:, axis], line[:, 1 - axis] = number * spacing, other
-            inside = _grid_line(out, _to_image(ground, line))
-            if len(inside):
-                # X near the end of its lines and Y near the middle, where they seldom meet
-                place = inside[len(inside) // (2 if axis else 8)]
-                labels.append((f"{'XY'[axis]} {number * spacing + 0:g} m", place))
+            yield axis, number * spacing + 0.0, _near(to_image(ground, line), size)
+
+
+def _near(pixels: Array, size: tuple[int, int]) -> list[Array]:
+    """The pieces of a line (k, 2) px that lie in the picture or not far from it."""
+    with np.errstate(invalid="ignore"):
+        near: NDArray[np.bool_] = np.asarray((np.abs(pixels) < FAR * np.array(size)).all(axis=1))
+    cuts = [0, *(np.flatnonzero(np.diff(near)) + 1), len(near)]
+    return [pixels[start:end] for start, end in pairwise(cuts) if near[start]]
+
+
+def _grid(out: Image, ground: GroundMap, world: Array) -> None:
+    """The grid with its metres, where they have room."""
+    size = out.shape[1::-1]
+    labels: list[tuple[str, Array]] = []
+    for axis, metres, pieces in grid_lines(ground, world, (size[0], size[1])):
+        inside = [piece[((piece >= 0) & (piece < size)).all(axis=1)] for piece in pieces]
+        for piece in pieces:
+            drawing.polyline(out, piece, PALE)
+        if shown := [place for piece in inside for place in piece]:
+            # X near the end of its lines and Y near the middle, where they seldom meet
+            labels.append((f"{'XY'[axis]} {metres:g} m", shown[len(shown) // (2 if axis else 8)]))
     taken: list[Array] = []
     room = np.array([0.11, 0.04]) * out.shape[0]
     legend = np.array([0.3, 0.36]) * out.shape[0]
@@ -106,19 +135,6 @@ def _grid(out: Image, ground: GroundMap, world: Array) -> None:
         if np.any(place > legend) and all(np.any(np.abs(place - other) > room) for other in taken):
             taken.append(place)
             drawing.label(out, text, place, PALE, 0.65)
-
-
-def _grid_line(out: Image, pixels: Array) -> Array:
-    """Draw what is visible of a line (k, 2) px; the points of it that lie inside the picture."""
-    size = np.array(out.shape[1::-1])
-    with np.errstate(invalid="ignore"):
-        near: NDArray[np.bool_] = np.asarray((np.abs(pixels) < FAR * size).all(axis=1))
-        inside = near & (pixels >= 0).all(axis=1) & (pixels < size).all(axis=1)
-    cuts = [0, *(np.flatnonzero(np.diff(near)) + 1), len(near)]
-    for start, end in pairwise(cuts):
-        if near[start]:
-            drawing.polyline(out, pixels[start:end], PALE)
-    return pixels[inside]
 
 
 def _mark(out: Image, index: int, ends: Array, mapped: Array, used: bool) -> None:
