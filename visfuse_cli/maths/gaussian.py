@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -20,7 +21,7 @@ def transpose(matrix: NDArray[Any]) -> Array:
 
 def symmetrise(cov: Array) -> Array:
     """The symmetric part of covariances (..., n, n); the one place where rounding's asymmetry is removed."""
-    return (cov + transpose(cov)) / 2
+    return (cov + transpose(cov)) * 0.5
 
 
 def inverse(cov: Array) -> Array:
@@ -53,7 +54,7 @@ def innovate(belief: Gaussian, residual: Array, H: Array, R: Array) -> tuple[Inn
     Raises LinAlgError where H P H^T + R is not positive definite.
     """
     H_P = H @ belief.cov
-    S = symmetrise(H_P @ transpose(H) + R)
+    S = H_P @ transpose(H) + R
     if residual.shape != H_P.shape[:-1]:
         shape = np.broadcast_shapes(residual.shape, H_P.shape[:-1])
         residual, H_P = np.broadcast_to(residual, shape), np.broadcast_to(H_P, (*shape, H_P.shape[-1]))
@@ -73,10 +74,18 @@ def update(belief: Gaussian, residual: Array, H: Array, R: Array) -> tuple[Gauss
     return correct(belief, innovation.residual, H, R, gain), innovation
 
 
+@cache
+def _identity(size: int) -> Array:
+    eye = np.eye(size)
+    eye.flags.writeable = False
+    return eye
+
+
 def correct(belief: Gaussian, residual: Array, H: Array, R: Array, gain: Array) -> Gaussian:
     """Belief (..., n) after a measurement taken in with any gain (..., n, m), optimal or not (Joseph form)."""
-    keep = np.eye(belief.mean.shape[-1]) - gain @ H
-    cov = keep @ belief.cov @ transpose(keep) + gain @ R @ transpose(gain)
+    keep = _identity(belief.mean.shape[-1]) - gain @ H
+    cov = keep @ belief.cov @ transpose(keep)
+    cov += gain @ R @ transpose(gain)
     return Gaussian(belief.mean + times(gain, residual), symmetrise(cov))
 
 

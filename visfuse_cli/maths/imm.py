@@ -88,10 +88,10 @@ def mix(bank: Bank, log_p: Array, angles: tuple[int, ...] = ()) -> tuple[Gaussia
 
     `angles` are components of the state on the circle. Bradshaw 1997, sec. 5.
     """
-    joint = log_p + bank.log_mu[..., :, None]  # p_ij mu_i: (..., i, j)
-    ahead = _log_sum(joint, axis=-2)  # c_j = sum_i p_ij mu_i: Jia 2008, eq. 23
-    share = np.exp(transpose(joint) - ahead[..., :, None])  # mu_i|j, j first: Jia 2008, eq. 24
-    return _matched(bank.beliefs, share, angles), ahead
+    p, mu = np.exp(log_p), np.exp(bank.log_mu)
+    c = np.maximum(mu @ p, np.finfo(float).tiny)  # c_j = sum_i p_ij mu_i: Jia 2008, eq. 23
+    share = p.T * mu[..., None, :] / c[..., None]  # mu_i|j, j first: Jia 2008, eq. 24
+    return _matched(bank.beliefs, share, angles), np.log(c)
 
 
 def _matched(beliefs: Gaussian, share: Array, angles: tuple[int, ...]) -> Gaussian:
@@ -99,11 +99,12 @@ def _matched(beliefs: Gaussian, share: Array, angles: tuple[int, ...]) -> Gaussi
     origin = beliefs.mean[..., :1, :]
     off = wrap_at(beliefs.mean - origin, angles)
     # Second moments about one origin near them all: the outer product of Jia 2008, eq. 26, in one matrix product.
-    second = beliefs.cov + off[..., :, None] * off[..., None, :]
+    second = off[..., :, None] * off[..., None, :]
+    second += beliefs.cov
     r, N = off.shape[-2:]
     shift = share @ off
-    mean_square = (share @ second.reshape(*off.shape[:-2], r, N * N)).reshape(*shift.shape, N)
-    cov = mean_square - shift[..., :, None] * shift[..., None, :]
+    cov = (share @ second.reshape(*off.shape[:-2], r, N * N)).reshape(*shift.shape, N)
+    cov -= shift[..., :, None] * shift[..., None, :]
     return Gaussian(wrap_at(origin + shift, angles), cov)
 
 
@@ -135,8 +136,15 @@ def weigh(ahead: Array, log_likelihood: Array) -> Array:
 
 def combined(bank: Bank, angles: tuple[int, ...] = ()) -> Gaussian:
     """One belief (..., N) for all models. Jia 2008, eqs. 30-31."""
-    one = _matched(bank.beliefs, np.exp(bank.log_mu)[..., None, :], angles)
-    return Gaussian(one.mean[..., 0, :], symmetrise(one.cov[..., 0, :, :]))
+    mu, beliefs = np.exp(bank.log_mu)[..., None, :], bank.beliefs
+    origin = beliefs.mean[..., :1, :]
+    off = wrap_at(beliefs.mean - origin, angles)
+    shift = mu @ off
+    off = off - shift
+    r, N = off.shape[-2:]
+    cov = (mu @ beliefs.cov.reshape(*off.shape[:-2], r, N * N)).reshape(*off.shape[:-2], N, N)
+    cov += (transpose(off) * mu) @ off
+    return Gaussian(wrap_at(origin + shift, angles)[..., 0, :], symmetrise(cov))
 
 
 def smooth(steps: Sequence[Step], log_p: Array, angles: tuple[int, ...] = ()) -> list[Bank]:

@@ -92,7 +92,7 @@ def _subsets(weights: Array) -> Array:
 
 
 def _passed(odds: Array) -> Array:
-    """Shares (n, m) by messages between tracks and measurements, nearly exact in large knots (Williams and Lau 2014)."""
+    """Shares (n, m) by messages to and fro, close to the sum where knots are large (Williams and Lau 2014)."""
     to_track = np.ones_like(odds)
     for _ in range(ROUNDS):
         said = odds * to_track
