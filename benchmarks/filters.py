@@ -1,7 +1,8 @@
-"""Time of one filter step a track against FilterPy: `python benchmarks/filters.py` (needs `pip install filterpy`).
+"""Time of one filter step a track against FilterPy and Stone Soup: `python benchmarks/filters.py`.
 
-One thread, both sides in turn in the same run, the median of fifteen, CPU time; FilterPy steps its tracks one after the other, so
-its time a track does not depend on how many there are. Where FilterPy has no such filter the ratio is left out.
+One thread, all sides in turn in the same run, CPU time, the median of fifteen. The others step their tracks one after
+the other: their time a track does not depend on how many there are. `pip install filterpy stonesoup`; where one has no
+such filter it is left out. The smoother runs over 50 steps, resampling over 1000 particles.
 """
 
 from __future__ import annotations
@@ -21,46 +22,56 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from visfuse_cli.maths import covariance_updating, fading, gaussian, imm, motion
+from benchmarks import rival_filters
+from benchmarks.rival_filters import Step
+from visfuse_cli.maths import course, covariance_updating, fading, gaussian, imm, motion, particles, smoothing
 from visfuse_cli.records import Gaussian
 
 DT = 0.04
 REPEATS = 15
-BLOCK = 200  # tracks in one call: more do not fit the cache
+STEPS, PARTICLES = 50, 1000
+BLOCK = 128  # tracks in one call: larger arrays come from the system anew each time, page by page
 Qs = np.stack([motion.constant_velocity_noise(DT, q, 3) for q in (0.01, 1.0, 10.0)])
 F3, H3, R3 = motion.constant_velocity(DT, 3), np.eye(3, 6), 0.04 * np.eye(3)
 POSE = np.diag([0.1, 0.1, 0.03]) ** 2
 
 
 def main() -> None:
-    try:
-        rivals: dict[str, Callable[[], None]] = {"Kalman, 6 states": rival_kalman(), "IMM, 3 models": rival_imm()}
-    except ImportError:
-        sys.exit("FilterPy is not installed: pip install filterpy")
-    ours = {
-        "Kalman, 6 states": kalman,
-        "IMM, 3 models": interacting,
-        "EKF, bicycle": bicycle,
-        "fading": faded,
-        "CUF": cuf,
-    }
-    print(f"{'':<20}{'tracks':>8}{'us a track':>12}{'FilterPy':>10}{'ratio':>8}")
-    for name, make in ours.items():
+    rivals: dict[str, dict[str, Step]] = {}
+    constants = (F3, Qs, H3, R3)
+    for package, make in (
+        ("FilterPy", lambda: rival_filters.filterpy(constants, STEPS, PARTICLES)),
+        ("Stone Soup", lambda: rival_filters.stone_soup(constants, DT, STEPS, PARTICLES)),
+    ):
+        try:
+            rivals[package] = make()
+        except ImportError:
+            print(f"{package} is not installed", file=sys.stderr)
+    print(f"{'':<20}{'tracks':>8}{'us a track':>12}" + "".join(f"{name:>12}{'ratio':>8}" for name in rivals))
+    for name, make_ours in OURS.items():
         for tracks in (1, 100, 10_000):
-            step, rival = make(min(tracks, BLOCK)), rivals.get(name)
-            calls = -(-tracks // BLOCK)  # of a block each
-            times, ratios = [], []
-            for _ in range(REPEATS):
-                own = clock(step, max(calls, 1000 // tracks)) * calls / tracks
-                times.append(own)
-                if rival is not None:
-                    ratios.append(clock(rival, 200) / own)
-            beside = f"{statistics.median(times) * statistics.median(ratios) * 1e6:10.1f}" if ratios else f"{'-':>10}"
-            ratio = f"{statistics.median(ratios):8.1f}" if ratios else f"{'-':>8}"
-            print(f"{name:<20}{tracks:>8}{statistics.median(times) * 1e6:12.2f}{beside}{ratio}", flush=True)
+            row = _row(make_ours, [own.get(name) for own in rivals.values()], tracks)
+            print(f"{name:<20}{tracks:>8}{row}", flush=True)
 
 
-def clock(step: Callable[[], None], count: int) -> float:
+def _row(make: Callable[[int], Step], others: list[Step | None], tracks: int) -> str:
+    """Our time a track, and each rival's with the ratio, us."""
+    step = make(min(tracks, BLOCK))
+    calls = -(-tracks // BLOCK)  # of a block each
+    own, ratios = [], [[] for _ in others]
+    for _ in range(REPEATS):
+        own.append(clock(step, max(calls, 500 // tracks)) * calls / tracks)
+        for other, ratio in zip(others, ratios, strict=True):
+            if other is not None:
+                ratio.append(clock(other, 20) / own[-1])
+    text = f"{statistics.median(own) * 1e6:12.2f}"
+    for ratio in ratios:
+        middle = statistics.median(ratio) if ratio else 0.0
+        text += f"{middle * statistics.median(own) * 1e6:12.1f}{middle:8.1f}" if ratio else f"{'-':>12}{'-':>8}"
+    return text
+
+
+def clock(step: Step, count: int) -> float:
     begun = time.process_time()
     for _ in range(count):
         step()
@@ -75,7 +86,7 @@ def beliefs(tracks: int, mean: np.ndarray) -> Gaussian:
     )
 
 
-def kalman(tracks: int) -> Callable[[], None]:
+def kalman(tracks: int) -> Step:
     belief = beliefs(tracks, np.zeros(6))
 
     def step() -> None:
@@ -85,7 +96,7 @@ def kalman(tracks: int) -> Callable[[], None]:
     return step
 
 
-def interacting(tracks: int) -> Callable[[], None]:
+def interacting(tracks: int) -> Step:
     bank, log_p = imm.start(beliefs(tracks, np.zeros(6)), 3), imm.transition(3, 0.95)
     F = np.stack([F3] * 3)
 
@@ -97,7 +108,7 @@ def interacting(tracks: int) -> Callable[[], None]:
     return step
 
 
-def bicycle(tracks: int) -> Callable[[], None]:
+def bicycle(tracks: int) -> Step:
     belief = beliefs(tracks, np.array([0, 0, 8.0, 0.3, 0.05]))
 
     def step() -> None:
@@ -109,7 +120,7 @@ def bicycle(tracks: int) -> Callable[[], None]:
     return step
 
 
-def faded(tracks: int) -> Callable[[], None]:
+def faded(tracks: int) -> Step:
     belief = beliefs(tracks, np.array([0, 0, 8.0, 0.3, 0.05]))
     H = motion.BICYCLE_MEASUREMENT
     memory = fading.start(belief, H, POSE)
@@ -123,7 +134,7 @@ def faded(tracks: int) -> Callable[[], None]:
     return step
 
 
-def cuf(tracks: int) -> Callable[[], None]:
+def cuf(tracks: int) -> Step:
     belief = beliefs(tracks, np.array([0, 0, 8.0, 0.3, 0.05, 0.5]))
     H = np.eye(6)[[0, 1, 3]]
 
@@ -135,38 +146,48 @@ def cuf(tracks: int) -> Callable[[], None]:
     return step
 
 
-def rival_kalman() -> Callable[[], None]:
-    own = _filterpy(Qs[1])
-    z = np.full(3, 0.1)
+def turning(tracks: int) -> Step:
+    belief = beliefs(tracks, np.array([0, 0, 8.0, 0.3, 0, 0.1]))
+    H, R = np.eye(2, 6), R3[:2, :2]
 
     def step() -> None:
-        own.predict()
-        own.update(z)
+        mean, F = course.advance(belief.mean, np.array(DT), course.CS)
+        Q = course.noise(belief.mean, np.array(DT), course.CS, 1.0, 0.1, (0.1, 0.1))
+        ahead = Gaussian(mean, gaussian.propagate(belief.cov, F, Q))
+        gaussian.update(ahead, 0.1 - ahead.mean[..., :2], H, R)
 
     return step
 
 
-def rival_imm() -> Callable[[], None]:
-    from filterpy.kalman import IMMEstimator
+def smoother(tracks: int) -> Step:
+    belief, before, after = beliefs(tracks, np.zeros(6)), [], []
+    for _ in range(STEPS):
+        before.append(gaussian.predict(belief, F3, Qs[1]))
+        belief, _ = gaussian.update(before[-1], 0.1 - before[-1].mean[..., :3], H3, R3)
+        after.append(belief)
+    filtered, predicted = (
+        Gaussian(np.stack([b.mean for b in each]), np.stack([b.cov for b in each])) for each in (after, before)
+    )
+    F = np.broadcast_to(F3, filtered.cov.shape)
+    return lambda: smoothing.rauch_tung_striebel(filtered, predicted, F)
 
-    p = np.exp(imm.transition(3, 0.95))
-    bank = IMMEstimator([_filterpy(Q) for Q in Qs], [1 / 3] * 3, p)
-    z = np.full(3, 0.1)
 
-    def step() -> None:
-        bank.predict()
-        bank.update(z)
-
-    return step
+def resampling(tracks: int) -> Step:
+    rng = np.random.default_rng(0)
+    log_weights = np.log(rng.dirichlet(np.ones(PARTICLES), () if tracks == 1 else (tracks,)))
+    return lambda: particles.systematic(log_weights, rng)
 
 
-def _filterpy(Q: np.ndarray):  # type: ignore[no-untyped-def]
-    from filterpy.kalman import KalmanFilter
-
-    own = KalmanFilter(dim_x=6, dim_z=3)
-    own.F, own.H, own.R, own.Q = F3, H3, R3, Q
-    own.x, own.P = np.zeros(6), 0.1 * np.eye(6)
-    return own
+OURS = {
+    "Kalman, 6 states": kalman,
+    "IMM, 3 models": interacting,
+    "EKF, constant speed": turning,
+    "EKF, bicycle": bicycle,
+    "fading": faded,
+    "CUF": cuf,
+    "smoother, 50 steps": smoother,
+    "resampling": resampling,
+}
 
 
 if __name__ == "__main__":

@@ -10,6 +10,7 @@ import numpy as np
 from scipy.sparse.csgraph import connected_components
 
 from visfuse_cli.maths import gaussian
+from visfuse_cli.maths.assignment import Indices
 from visfuse_cli.records import Array, Gaussian
 
 EXACT = 10  # measurements in one knot of tracks up to which all joint events are summed
@@ -47,7 +48,7 @@ def update(belief: Gaussian, z: Array, H: Array, R: Array, share: Array) -> Gaus
         return gaussian.moment_match(means, covs, np.log(np.clip(share, 0, None)))
 
 
-def _knots(possible: Array) -> list[tuple[Array, Array]]:
+def _knots(possible: Array) -> list[tuple[Indices, Indices]]:
     """Tracks and measurements that hang together by possible pairs (n, m)."""
     n, m = possible.shape
     links = np.zeros((n + m, n + m), dtype=bool)
