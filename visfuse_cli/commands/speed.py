@@ -38,6 +38,7 @@ from visfuse_cli.tracking.ground import GroundTracker
 from visfuse_cli.tracking.lanes import Way, find_lanes, lane_of, thinned
 from visfuse_cli.tracking.options import SpeedOptions
 from visfuse_cli.tracking.output import COLUMNS, abandoned_row, row_of, track_record
+from visfuse_cli.tracking.privacy import Strangers
 from visfuse_cli.tracking.summary import summarised, text
 from visfuse_cli.tracking.targets import Abandoned, Track
 from visfuse_cli.tracking.verdict import judge
@@ -99,6 +100,7 @@ class _Results:
     began: dict[str, datetime | None] = field(default_factory=dict)
     doubts: list[str] = field(default_factory=list)  # about times of day
     watches: dict[str, CameraWatch] = field(default_factory=dict)
+    strangers: dict[str, Strangers] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
@@ -154,7 +156,8 @@ def run(request: RunRequest) -> RunResult:
                 if path.name in results.drawn:
                     name = f"annotated-{path.stem}.mp4" if several else "annotated.mp4"
                     _annotate(path, folder / name, ground, request, run_, spool, results, lanes)
-        _keep_calibration_picture(request.options["homography"], folder)
+        if not config.privacy.blur:  # the picture shows a frame of the footage
+            _keep_calibration_picture(request.options["homography"], folder)
         summary = summarised(
             results.speeds, len(results.rejected), config.display.units, run_.counts["frames"], results.audits, folder
         )
@@ -225,6 +228,7 @@ def _track(clip: _Clip, run_: Run, spool: TrackSpool, results: _Results, first_i
     """Follow everything in one clip; returns the next free id."""
     tracker = GroundTracker(clip.camera, clip.config, first_id)
     results.drawn[clip.name] = []
+    strangers = results.strangers[clip.name] = Strangers(clip.camera)
     with run_.stage("warm up"):
         empty = empty_picture(at_rest(_sampled(clip.source, clip.config.background.warmup_s)))
         watch = results.watches[clip.name] = CameraWatch(empty)
@@ -240,6 +244,8 @@ def _track(clip: _Clip, run_: Run, spool: TrackSpool, results: _Results, first_i
         with run_.stage("track"):
             tracker.predict(frame.t)
             ended = tracker.update(frame.index, evidence)
+            if clip.config.privacy.blur:
+                strangers.add(frame.index, tracker.unexplained)
         with run_.stage("conclude"):
             _settle(*ended, clip, tracker, run_, spool, results, label)
         with run_.stage("learn"):
@@ -363,12 +369,12 @@ def _annotate(
     with _open(path, request) as source:
         camera = _camera(ground, source, request.config)
         records = (spool.read(identity) for _, identity in sorted(results.drawn[path.name]))
-        watch = results.watches[path.name]
+        watch, strangers = results.watches[path.name], results.strangers[path.name]
         with (
             VideoWriter(out, source.width, source.height, source.nominal_rate) as video,
             run_.background(video) as sink,
         ):
-            for frame in annotate(run_.frames(source), records, camera, config.display.units, watch, places):
+            for frame in annotate(run_.frames(source), records, camera, config, watch, strangers, places):
                 sink.write(frame.image, frame.t)
 
 

@@ -12,8 +12,11 @@ from visfuse_cli.maths.polygons import Polygon
 from visfuse_cli.maths.speed import KMH
 from visfuse_cli.records import Array, Frame, GroundCamera, Image
 from visfuse_cli.tracking.camera_watch import CameraWatch
+from visfuse_cli.tracking.options import SpeedOptions
 from visfuse_cli.tracking.output import box_corners
+from visfuse_cli.tracking.privacy import Strangers, parts
 from visfuse_cli.vision import drawing
+from visfuse_cli.vision.blurring import blur
 from visfuse_cli.vision.lens import distort_points
 from visfuse_cli.vision.steady import moved
 
@@ -26,7 +29,7 @@ UNITS = {"km/h": KMH, "mph": 2.2369362920544, "m/s": 1.0}
 class _Drawn:
     """One track, ready to be drawn on its frames."""
 
-    def __init__(self, record: dict[str, Any], camera: GroundCamera, units: str) -> None:
+    def __init__(self, record: dict[str, Any], camera: GroundCamera, config: SpeedOptions) -> None:
         states = record["states"]
         self.first, self.last = states[0]["frame"], states[-1]["frame"]
         self._row = {state["frame"]: k for k, state in enumerate(states)}
@@ -36,6 +39,12 @@ class _Drawn:
         self._feet = _on_image(camera, position)
         self._measured = [state["measured"] for state in states]
         self._t = np.array([state["t"] for state in states])
+        self._private: list[Array] = []
+        if config.privacy.blur:
+            walks = config.target.motion == "constant-velocity" or record["class"] == "person"
+            size = np.array(record["summary"]["size"])
+            self._private = parts(camera, pose, size, walks, record["class"] == "two-wheeler")
+        units = config.display.units
         summary, factor = record["summary"], UNITS[units]
         half = (summary["speed_ci95"][1] - summary["speed_ci95"][0]) / 2
         self._text = f"{record['id']}  {summary['speed'] * factor:.1f} +-{half * factor:.1f} {units}"
@@ -43,6 +52,11 @@ class _Drawn:
         if summary["rejected"]:
             self._text = f"{record['id']}  rejected"
             self._colour = (150, 150, 150)
+
+    def blurred(self, frame: int) -> list[Array]:
+        """Outlines (8, 2) px, with the camera at rest, of what nobody is to recognise in a frame."""
+        k = self._row.get(frame)
+        return [] if k is None else [part[k] for part in self._private]
 
     def draw(self, image: Image, frame: int, image_from_rest: Array) -> None:
         k = self._row.get(frame)
@@ -81,20 +95,22 @@ class _Place:
                 drawing.polyline(image, line[part], PALE, width=1)
         inside = line[shown & (line >= 0).all(axis=1) & (line < size).all(axis=1)]
         if len(inside):
-            drawing.label(image, self._name, inside[np.argmax(inside[:, 1])], PALE, 0.8)
+            drawing.label(image, self._name, inside.mean(axis=0), PALE, 0.8)
 
 
 def annotate(
     frames: Iterable[Frame],
     records: Iterable[dict[str, Any]],
     camera: GroundCamera,
-    units: str,
+    config: SpeedOptions,
     watch: CameraWatch,
+    strangers: Strangers,
     places: Mapping[str, Polygon],
 ) -> Iterator[Frame]:
     """Draw the tracks, given in the order of their first frames, on the frames; only the tracks in view are held.
 
-    `places` are polygons on the ground by name: lanes, the region; an empty one is none.
+    `places` are polygons on the ground by name: lanes, the region; an empty one is none. Where privacy is asked for,
+    `strangers` are blurred as well.
     """
     marked = [_Place(name, np.array(polygon), camera) for name, polygon in places.items() if polygon]
     waiting = iter(records)
@@ -102,11 +118,15 @@ def annotate(
     active: list[_Drawn] = []
     for frame in frames:
         while upcoming is not None and upcoming["states"][0]["frame"] <= frame.index:
-            active.append(_Drawn(upcoming, camera, units))
+            active.append(_Drawn(upcoming, camera, config))
             upcoming = next(waiting, None)
         active = [drawn for drawn in active if drawn.last >= frame.index]
         motion = watch.image_from_rest(frame.index)
         here = np.eye(3) if motion is None else motion
+        if config.privacy.blur:
+            private = [outline for drawn in active for outline in drawn.blurred(frame.index)]
+            private += strangers.outlines(frame.index)
+            blur(frame.image, (moved(here, outline) for outline in private))
         for place in marked:
             place.draw(frame.image, here)
         for drawn in active:

@@ -12,6 +12,7 @@ from visfuse_cli.maths.assignment import gate_size
 from visfuse_cli.maths.cameras import ground_scale, project
 from visfuse_cli.maths.gaussian import mahalanobis
 from visfuse_cli.records import Array, GroundCamera
+from visfuse_cli.records import Region as ImageRegion
 from visfuse_cli.tracking import dynamics as dynamics_tools
 from visfuse_cli.tracking import measure
 from visfuse_cli.tracking.association import claim, footprint_contains
@@ -49,6 +50,7 @@ class GroundTracker:
         self.settings = settings
         self.dynamics: Dynamics = dynamics_tools.for_target(settings.target, settings.filter)
         self.tracks: list[Track] = []
+        self.unexplained: list[ImageRegion] = []  # what moved in the last frame and belongs to no track
         self.next_id = first_id
         self._nursery = Nursery(camera, settings, self.dynamics)
         self._region = Region(np.array(settings.region)) if settings.region else None
@@ -76,7 +78,8 @@ class GroundTracker:
             self._measure(frame, evidence)
         self._remember(frame, evidence)
         self._reconsider(evidence)
-        self._nursery.feed(frame, self._t, evidence.leftovers(*self._boxes()))
+        self.unexplained = evidence.leftovers(*self._boxes())
+        self._nursery.feed(frame, self._t, self.unexplained)
         self.next_id = self._nursery.born(self.next_id, self.tracks, self._held, self._recent, self._boxes_at)
         self._held += self._end()
         return self._released(), self._nursery.give_up(self._t)

@@ -11,6 +11,7 @@ from visfuse_cli.config import Section
 from visfuse_cli.maths.polygons import Polygon, surrounding
 from visfuse_cli.tracking.foreground import BackgroundSettings, RegionSettings
 from visfuse_cli.tracking.lanes import LaneSettings
+from visfuse_cli.tracking.privacy import PrivacySettings
 from visfuse_cli.tracking.settings import TrackerSettings
 from visfuse_cli.tracking.verdict import SpeedSettings
 
@@ -33,6 +34,7 @@ class SpeedOptions(TrackerSettings):
     )
     lane_finding: LaneSettings = LaneSettings()
     display: DisplaySettings = DisplaySettings()
+    privacy: PrivacySettings = PrivacySettings()
 
     @field_validator("lanes")
     @classmethod
