@@ -15,10 +15,12 @@ from datetime import UTC, datetime
 from types import FrameType, TracebackType
 from typing import Any, Protocol, TypeVar
 
+import cv2
 from tqdm import tqdm
 
 from visfuse_cli.files.video import VideoSource
 from visfuse_cli.records import Frame, FrameSet
+from visfuse_cli.threads import thread_cap
 
 T = TypeVar("T")
 AHEAD = 3  # pictures that wait between two threads: enough to even out, too few to fill memory
@@ -48,6 +50,7 @@ class Run:
         self._handlers: dict[int, Any] = {}
 
     def __enter__(self) -> Run:
+        cv2.setNumThreads(thread_cap() or -1)  # -1: OpenCV's own choice
         if threading.current_thread() is threading.main_thread():
             self._handlers = {number: signal.signal(number, self._stop) for number in STOP_SIGNALS}
         return self
@@ -128,6 +131,9 @@ class Run:
 
         What is handed over must not be changed afterwards. Closing the sink stays with its owner, after this block.
         """
+        if thread_cap() == 1:
+            yield _TimedWriter(sink, self)
+            return
         writer = _BackgroundWriter(sink)
         try:
             yield writer
@@ -175,6 +181,17 @@ class _Cursor:
         return best
 
 
+class _TimedWriter:
+    """Writes in the thread of its caller, where a run may use no other."""
+
+    def __init__(self, sink: Sink, run: Run) -> None:
+        self._sink, self._run = sink, run
+
+    def write(self, *values: Any) -> None:
+        with self._run.stage("write"):
+            self._sink.write(*values)
+
+
 class _BackgroundWriter:
     def __init__(self, sink: Sink) -> None:
         self._sink = sink
@@ -209,8 +226,12 @@ class _BackgroundWriter:
 def ahead(produce: Callable[[], Iterator[T]], limit: int = AHEAD) -> Iterator[Iterator[T]]:
     """Run a generator in a thread of its own, at most `limit` items ahead; its exception is raised in the consumer.
 
-    The whole generator lives in that thread, decoders included; leaving the block ends and joins it.
+    The whole generator lives in that thread, decoders included; leaving the block ends and joins it. Where a run may
+    use no other thread, it is run in the consumer's.
     """
+    if thread_cap() == 1:
+        yield produce()
+        return
     items: queue.Queue[tuple[T | None, BaseException | None]] = queue.Queue(limit)
     stopped = threading.Event()
 

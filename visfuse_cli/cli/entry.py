@@ -12,7 +12,7 @@ from typing import NoReturn
 import typer
 
 from visfuse_cli import __version__
-from visfuse_cli.cli import calibrate, configure, read, track  # noqa: F401  (each adds its commands to the app)
+from visfuse_cli.cli import batch, calibrate, configure, read, track  # noqa: F401  (each adds its commands to the app)
 from visfuse_cli.cli.app import app
 from visfuse_cli.errors import VisfuseError
 

@@ -19,6 +19,7 @@ from av.stream import Disposition
 from visfuse_cli.errors import InputError
 from visfuse_cli.files.timing import TimeAuditor, plural
 from visfuse_cli.records import Image
+from visfuse_cli.threads import thread_cap
 
 # Silence, not a level: PyAV's log callback waits for the GIL in decoder threads, and closing a decoder deadlocks on it.
 av.logging.set_level(None)
@@ -164,6 +165,7 @@ class Clip:
             if not streams or container.format.name.endswith("_pipe") or container.format.name == "image2":
                 raise InputError(f"{self.path}: holds no video; give a video file or a folder of images")
             streams[0].thread_type = "AUTO"
+            streams[0].codec_context.thread_count = thread_cap() or 0  # 0: one a core
             yield container, streams[0]
 
 

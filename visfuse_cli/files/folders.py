@@ -49,12 +49,13 @@ def list_files(folder: Path, suffixes: frozenset[str]) -> list[Path]:
         found = [p for p in folder.iterdir() if p.suffix.lower() in suffixes and p.name[0] != "." and p.is_file()]
     except OSError as problem:
         raise InputError(f"{folder}: cannot be read: {problem.strerror}") from problem
-    return sorted(found, key=_natural)
+    return sorted(found, key=lambda path: natural(path.name))
 
 
-def _natural(path: Path) -> tuple[list[tuple[int, str]], str]:
-    parts = re.split(r"([0-9]+)", path.name.lower())
-    return [(int(part), "") if part[:1].isdecimal() else (-1, part) for part in parts], path.name
+def natural(name: str) -> tuple[list[tuple[int, str]], str]:
+    """The key that sorts names as people do: frame2 before frame10."""
+    parts = re.split(r"([0-9]+)", name.lower())
+    return [(int(part), "") if part[:1].isdecimal() else (-1, part) for part in parts], name
 
 
 def describe(path: str | Path) -> dict[str, Any]:

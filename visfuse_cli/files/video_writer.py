@@ -14,6 +14,7 @@ import numpy as np
 from visfuse_cli.errors import OutputError
 from visfuse_cli.files.atomic import replacing_path
 from visfuse_cli.records import Image
+from visfuse_cli.threads import thread_cap
 
 # A third of mp4v's size at a better picture and 1.7 times its speed (measured, 720p).
 PRESET, QUALITY = "ultrafast", "26"
@@ -54,6 +55,7 @@ class VideoWriter:
         stream.time_base = stream.codec_context.time_base = Fraction(1, CLOCK)
         stream.codec_context.gop_size = max(1, round(KEYFRAME_S * self._rate))
         stream.codec_context.color_range, stream.codec_context.colorspace = LIMITED, BT601
+        stream.codec_context.thread_count = thread_cap() or 0  # 0: as x264 sees fit
         stream.options = {"preset": PRESET, "crf": QUALITY}
         return stream
 

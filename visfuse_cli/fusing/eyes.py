@@ -15,6 +15,7 @@ from visfuse_cli.fusing.settings import FuseConfig
 from visfuse_cli.fusing.tracker import Newcomer, Tracker
 from visfuse_cli.maths import multiview
 from visfuse_cli.records import Array, Frame, FrameSet, Image, Sighting, View
+from visfuse_cli.threads import thread_cap
 from visfuse_cli.vision.background import empty_picture
 from visfuse_cli.vision.straighten import Straight
 
@@ -100,7 +101,7 @@ class PictureEyes:
 
     def __init__(self, views: list[View], footage: list[Any], config: FuseConfig) -> None:
         straight = [Straight(view, config.sight.pixels) for view in views]
-        with ThreadPoolExecutor(THREADS) as pool:
+        with ThreadPoolExecutor(min(THREADS, thread_cap() or THREADS)) as pool:
             empty = list(pool.map(_empty, straight, footage, [config.background.warmup_s] * len(views)))
         self._cameras = [Camera(each, picture, config) for each, picture in zip(straight, empty, strict=True)]
         self.P = np.stack(
@@ -112,7 +113,7 @@ class PictureEyes:
         self._names = [view.name for view in views]
         self._watch = PictureWatch(self._cameras, self.P, config)
         self._dt: dict[int, float] = {}
-        self._pool = ThreadPoolExecutor(THREADS)
+        self._pool = ThreadPoolExecutor(min(THREADS, thread_cap() or THREADS))
 
     def detect(self, instant: FrameSet) -> None:
         """Find out what moves in each picture of a set."""

@@ -1,0 +1,41 @@
+"""How many threads a run's libraries may use: the variable VISFUSE_THREADS, where several runs share a machine."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from visfuse_cli.errors import UsageError
+
+VARIABLE = "VISFUSE_THREADS"
+
+
+def thread_cap() -> int | None:
+    """The most threads that OpenCV, FFmpeg and the stages of a run may use each; None: as many as there are cores.
+
+    With 1, decoding and writing run in the thread of the run itself. Raises UsageError where the variable is no count.
+    """
+    text = os.environ.get(VARIABLE)
+    if not text:
+        return None
+    if not (text.isdecimal() and 0 < int(text) <= 1024):
+        raise UsageError(f"{VARIABLE}={text}: a number of threads, 1 to 1024")
+    return int(text)
+
+
+@contextmanager
+def capped(threads: int) -> Iterator[None]:
+    """Cap the block's runs, and the linear algebra they call, to so many threads each."""
+    from threadpoolctl import threadpool_limits  # of the extra `batch`, whose workers alone come here
+
+    before = os.environ.get(VARIABLE)
+    os.environ[VARIABLE] = str(threads)
+    try:
+        with threadpool_limits(threads):
+            yield
+    finally:
+        if before is None:
+            del os.environ[VARIABLE]
+        else:
+            os.environ[VARIABLE] = before
