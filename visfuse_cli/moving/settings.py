@@ -47,7 +47,9 @@ class SegmentationSettings(Section):
 class FilterSettings(Section):
     """The motion models and how they take turns."""
 
-    kind: Literal["imm", "drifting", "cv", "ca", "periodic"] = Field("imm", description="all of them, or one alone")
+    kind: Literal["imm", "drifting", "cv", "ca", "periodic", "csd", "cs", "cd"] = Field(
+        "imm", description="all of them, or one alone; csd, cs and cd are those of a pan-tilt head"
+    )
     stay: float = Field(0.97, gt=0.5, lt=1, description="probability that a model goes on over one frame")
     q_drifting: float = Field(0.2, gt=0, description="m^2/s of a drifting point's walk")
     q_cv: float = Field(0.01, gt=0, description="m^2 s^-3 of constant velocity: tight, for straight ways")
@@ -55,6 +57,12 @@ class FilterSettings(Section):
     q_periodic: float = Field(0.05, gt=0, description="m^2 s^-3 of the periodic motion")
     omega: float = Field(1.0, gt=0, le=50, description="rad/s of the periodic motion")
     euler: bool = Field(False, description="the periodic motion by the paper's growing forward step")
+    sigma_speed: float = Field(
+        0.2, gt=0, description="m/s^2 per root Hz: what changes a constant speed (pan-tilt head)"
+    )
+    sigma_course: float = Field(0.05, gt=0, description="rad/s per root Hz: what changes a constant direction")
+    sigma_turn: float = Field(0.8, gt=0, description="rad/s^2 per root Hz: what changes the rate of turn")
+    sigma_pull: float = Field(1.0, gt=0, description="m/s^3 per root Hz: what changes the acceleration")
     start_speed: float = Field(1.5, gt=0, le=100, description="m/s: deviation of the velocity at the start")
 
 
@@ -79,6 +87,22 @@ class LifeSettings(Section):
     min_moved: float = Field(0.4, ge=0, le=1000, description="m that a target found unaided must move in the world")
 
 
+class GazeSettings(Section):
+    """A pan-tilt head."""
+
+    order: Literal["elevation-vergence", "vergence-elevation"] = Field(
+        "elevation-vergence", description="which axis is outside: the first one carries the other"
+    )
+
+
+class TargetSettings(Section):
+    """What is tracked, before a pan-tilt head."""
+
+    height: float | None = Field(
+        None, ge=0, le=100, description="m: height over the ground of the box's middle; empty: its lower edge stands on it"
+    )
+
+
 class DisplaySettings(Section):
     """Annotation and screen only."""
 
@@ -101,6 +125,8 @@ class ImmConfig(Section):
     filter: FilterSettings = FilterSettings()
     measure: MeasureSettings = MeasureSettings()
     life: LifeSettings = LifeSettings()
+    gaze: GazeSettings = GazeSettings()
+    target: TargetSettings = TargetSettings()
     display: DisplaySettings = DisplaySettings()
     latency: float = Field(0.0, ge=0, le=10, description="s: every state is also predicted this far ahead")
     smooth: bool = Field(True, description="true: a backward pass over each whole track; false: causal output")
