@@ -73,7 +73,13 @@ def cast(rays: Array, centre: Array, planes: Sequence[Plane], figures: Sequence[
 
 
 def _paint(
-    picture: Picture, best: Array, depth: Array, inside: NDArray[np.bool_], texture: Picture, at: list[Array], wrap: bool
+    picture: Picture,
+    best: Array,
+    depth: Array,
+    inside: NDArray[np.bool_],
+    texture: Picture,
+    at: list[Array],
+    wrap: bool,
 ) -> None:
     good = inside & (depth > 0.1) & (depth < best)
     if not good.any():
@@ -116,10 +122,16 @@ def clothes(seed: int, look: str = "patterned") -> Picture:
     """A person's front: head, top and trousers; patterned, plain, or the carton of a box."""
     rng = np.random.default_rng((seed, 34))
     if look == "box":
-        carton = cv2.resize(rng.uniform(30, 230, (9, 7, 3)).astype(np.float32), (70, 90), interpolation=cv2.INTER_NEAREST)
+        carton = cv2.resize(
+            rng.uniform(30, 230, (9, 7, 3)).astype(np.float32), (70, 90), interpolation=cv2.INTER_NEAREST
+        )
         return np.asarray(cv2.GaussianBlur(carton, (0, 0), 1.0))
     texture = np.zeros((170, 55, 3), np.float32)
-    parts = ((0, 24, np.array([150, 175, 215.0])), (24, 85, rng.uniform(30, 230, 3)), (85, 170, rng.uniform(20, 120, 3)))
+    parts = (
+        (0, 24, np.array([150, 175, 215.0])),
+        (24, 85, rng.uniform(30, 230, 3)),
+        (85, 170, rng.uniform(20, 120, 3)),
+    )
     for low, high, colour in parts:
         texture[low:high] = colour
     if look == "patterned":

@@ -141,7 +141,7 @@ def room(
 
 
 def visit(seed: int, *, look: str = "patterned", size: tuple[int, int] = (256, 220)) -> HeadScene:
-    """A target 3 to 6 m away that goes straight, turns by 60 to 100 degrees, goes on, turns back, and leaves the view."""
+    """A target 3 to 6 m away that goes straight, turns by 60 to 100 degrees, later turns back, and leaves the view."""
     rng = np.random.default_rng((seed, 35))
     pace, side = rng.uniform(0.7, 1.2), 1.0 if rng.random() < 0.5 else -1.0
     near = np.array([-1.4 * side, rng.uniform(3.5, 4.0)])

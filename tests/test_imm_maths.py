@@ -192,9 +192,8 @@ def test_the_optical_axis_and_the_pitch_are_the_contracts():
 def test_a_camera_beside_the_axle_is_carried_by_the_turn():
     t = np.linspace(0, 2, 41)
     w, b = 0.5, 0.4
-    poses = odometry.from_wheels(
-        t, np.full(41, -w * b / 2), np.full(41, w * b / 2), b, 0.2, np.array([0.3, -0.5, 0.1]), t, (0, 0)
-    )
+    drive = odometry.Drive(t, np.full(41, -w * b / 2), np.full(41, w * b / 2), b, (0, 0))
+    poses = drive.camera(t, 0.2, np.array([0.3, -0.5, 0.1]))
     np.testing.assert_allclose(np.linalg.norm(poses.T[:, [0, 2]], axis=1), np.hypot(0.3, 0.1), atol=1e-12)
     np.testing.assert_allclose(poses.theta, w * t + 0.2, atol=1e-12)
 

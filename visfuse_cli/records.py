@@ -94,6 +94,16 @@ class StereoRig:
 
 
 @dataclass(frozen=True, slots=True)
+class GivenTarget:
+    """A target named by hand: frame, left quad (4, 2) px clockwise from the top left, right quad or None, speed m/s."""
+
+    frame: int
+    left: Array
+    right: Array | None
+    speed: float | None
+
+
+@dataclass(frozen=True, slots=True)
 class View:
     """One of several fixed cameras: x_camera = R x_world + t, R (3, 3), t (3,) m; size (w, h) px of its footage."""
 

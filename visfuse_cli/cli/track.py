@@ -139,14 +139,18 @@ def track_imm(
         typer.Argument(metavar="SCENE", help="A folder: left.*, right.*, calibration.yaml, sensors.csv; init.yaml."),
     ],
     shared: Tracking,
+    homography: Annotated[
+        Path | None,
+        typer.Option("--homography", metavar="H.json", help="Of a pan-tilt head; else homography.json of the scene."),
+    ] = None,
 ) -> None:
-    """What moves before a moving stereo camera, in 3D, by interacting motion models.
+    """What moves before a moving stereo camera, in 3D, or on the ground before a pan-tilt head.
 
     Example: visfuse track-imm scene --out run
     """
     from visfuse_cli.commands import track_imm as command
 
-    _finish(command, _request("track-imm", scene, shared), shared)
+    _finish(command, _request("track-imm", scene, shared, homography=homography), shared)
 
 
 @app.command("demo")

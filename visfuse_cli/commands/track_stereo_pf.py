@@ -26,14 +26,14 @@ from visfuse_cli.files.runfolder import RunFolder
 from visfuse_cli.files.scene import check_scene, file, find_file, view
 from visfuse_cli.files.spool import TrackSpool
 from visfuse_cli.files.stereo_calibration import FILES, read_rig
-from visfuse_cli.files.stereo_scene import GivenPath, GivenTarget, read_init, read_path
+from visfuse_cli.files.stereo_scene import GivenPath, read_init, read_path
 from visfuse_cli.files.video import VideoSource, describe, open_source
 from visfuse_cli.files.video_writer import VideoWriter
 from visfuse_cli.maths import paths
 from visfuse_cli.maths.paths import Way
 from visfuse_cli.maths.planes import triangulated
 from visfuse_cli.pipeline import Run
-from visfuse_cli.records import Array, FrameSet, Image, Lens, RunRequest, RunResult, StereoRig
+from visfuse_cli.records import Array, FrameSet, GivenTarget, Image, Lens, RunRequest, RunResult, StereoRig
 from visfuse_cli.vision import patches
 from visfuse_cli.vision.background import empty_picture
 from visfuse_cli.vision.epipolar_check import epipolar_residual

@@ -11,20 +11,10 @@ import numpy as np
 
 from visfuse_cli.config import parse_yaml, read_text
 from visfuse_cli.errors import InputError
-from visfuse_cli.records import Array
+from visfuse_cli.records import Array, GivenTarget
 
 MOST = 10_000  # points of a path
 FARTHEST_PX = 1e5
-
-
-@dataclass(frozen=True, slots=True)
-class GivenTarget:
-    """A target named by hand: frame, left quad (4, 2) px clockwise from the top left, right quad or None, speed m/s."""
-
-    frame: int
-    left: Array
-    right: Array | None
-    speed: float | None
 
 
 @dataclass(frozen=True, slots=True)

@@ -47,11 +47,11 @@ def conclude(target: Target, ground: GroundMap) -> dict[str, Any] | None:
     }
 
 
-def _summary(
-    target: Target, t: Array, seen: Array, distance: float, duration: float, cov: Array
-) -> dict[str, Any]:
+def _summary(target: Target, t: Array, seen: Array, distance: float, duration: float, cov: Array) -> dict[str, Any]:
     speed = distance / duration
     doubt = float(np.sqrt(np.trace(cov[0, :2, :2]) / 2 + np.trace(cov[-1, :2, :2]) / 2)) / duration
+    ahead = prediction_errors(target)
+    predicted = {} if ahead is None else {"prediction_rms_2d": ahead[0], "prediction_rms_3d": ahead[1]}
     return {
         "t_start": float(t[0]),
         "t_end": float(t[-1]),
@@ -63,6 +63,7 @@ def _summary(
         "nis_dof": 4,
         "size": target.size.tolist(),
         "ended": target.ended_by,
+        **predicted,
     }
 
 
@@ -77,7 +78,7 @@ def _state(target: Target, k: int, mean: Array, cov: Array, models: dict[str, fl
         "velocity": mean[2:].tolist(),
         "covariance": ((cov + cov.T) / 2).tolist(),
         "speed": speed,
-        "speed_sigma": float(np.sqrt(max(unit @ cov[2:, 2:] @ unit, 0.0))),
+        "speed_sigma": float(np.sqrt(max(float(unit @ cov[2:, 2:] @ unit), 0.0))),
         "box": {"left": look.box.tolist()},
         "measured": look.z is not None,
     }

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,46 +12,108 @@ from visfuse_cli.gazing.head import Head
 from visfuse_cli.moving.settings import ImmConfig
 from visfuse_cli.records import Array, Image
 from visfuse_cli.vision import normal_flow
+from visfuse_cli.vision.patches import Grey
 
+GAP_S = 0.1  # between the pictures that are compared: what is slow has then moved, too
 ALIKE = 0.4  # overlap with the region of the frame before
+JOINED = 0.5  # of the narrower one's width: what lies in line, and no further than the higher one is high, is one thing
 KNOWN = 0.2  # overlap with what is followed already
 
 
-@dataclass(slots=True)
-class _Candidate:
-    boxes: list[Array]
+@dataclass(frozen=True, slots=True)
+class View:
+    """One frame: its number, time, gaze, pyramid of grey pictures, and what was followed in it, boxes [x, y, w, h]."""
+
+    frame: int
+    t: float
+    gaze: Array
+    levels: list[Grey]
+    known: list[Array]
+
+    @property
+    def grey(self) -> Image:
+        """The picture itself (H, W)."""
+        return np.asarray(self.levels[0], np.uint8)
 
 
 class Finder:
-    """Finds regions that move, frame by frame."""
+    """Finds regions that move: each picture is compared with those GAP_S before and after, so that only what is at its
+    place in the picture itself stands out in both.
+    """
 
     def __init__(self, head: Head, config: ImmConfig) -> None:
         self._head, self._config = head, config
-        self._candidates: list[_Candidate] = []
+        self._views: deque[View] = deque()
+        self._candidates: list[list[Array]] = []  # of each, its boxes [u0, v0, u1, v1] px so far
 
-    def look(self, before: Image, after: Image, gazes: tuple[Array, Array], known: list[Array]) -> list[Array]:
-        """Quads (4, 2) px of regions that moved for some frames and are none of the `known` boxes [x, y, w, h]."""
-        K = self._head.lens.K
-        R = self._head.rotation(gazes[1]).T @ self._head.rotation(gazes[0])
-        was, there = normal_flow.turned(before, R, K)
-        flow, gradient = normal_flow.normal_flow(was, after, self._config.flow.sigma)
+    def look(self, view: View) -> tuple[list[Array], list[View]]:
+        """Quads (4, 2) px of what moved for some frames and is not followed, and the views from theirs to this one."""
+        views = self._views
+        views.append(view)
+        middle = next((k for k, each in enumerate(views) if view.t - each.t <= GAP_S), len(views) - 1)
+        middle = min(middle, len(views) - 2)
+        first = next((k for k in range(middle, -1, -1) if views[middle].t - views[k].t >= GAP_S), None)
+        if first is None or middle < 1:
+            return [], []
+        for _ in range(first):
+            views.popleft()
+        middle -= first
+        return self._confirmed(self._regions(views[0], views[middle], view), views[middle].known), list(views)[middle:]
+
+    def _regions(self, before: View, now: View, after: View) -> list[tuple[Array, int]]:
+        """Boxes and areas of what has moved since the view before, and moves on to the view after."""
         settings = self._config.segmentation
-        least = settings.smallest * after.size
+        picture = now.grey
+        least, gradient, known = np.full(picture.shape, np.inf), np.zeros(picture.shape), np.full_like(picture, 255)
+        for other in (before, after):
+            R = self._head.rotation(now.gaze).T @ self._head.rotation(other.gaze)
+            turned, there = normal_flow.turned(other.grey, R, self._head.lens.K)
+            flow, slope = normal_flow.normal_flow(turned, picture, self._config.flow.sigma)
+            known = np.minimum(known, there)
+            rest = normal_flow.steadied(flow, slope, known)
+            least, gradient = np.minimum(least, np.linalg.norm(rest, axis=-1)), np.maximum(gradient, slope)
+        return _whole(normal_flow.grown(least, gradient, known, settings.residual_px))
+
+    def _confirmed(self, regions: Sequence[tuple[Array, int]], known: Sequence[Array]) -> list[Array]:
+        least = self._config.segmentation.smallest * self._views[0].grey.size
         held = [np.append(box[:2], box[:2] + box[2:]) for box in known]
         kept, ready = [], []
-        for box, area in normal_flow.grown(flow, gradient, there, settings.residual_px):
+        for box, area in regions:
             if area < least or any(_shared(box, other) > KNOWN for other in held):
                 continue
-            old = next((c for c in self._candidates if _shared(c.boxes[-1], box) > ALIKE), None)
-            boxes = [*(old.boxes if old is not None else []), box]
+            boxes = [*next((each for each in self._candidates if _shared(each[-1], box) > ALIKE), []), box]
             if len(boxes) < self._config.life.confirm_frames:
-                kept.append(_Candidate(boxes))
+                kept.append(boxes)
                 continue
-            half = np.median([np.subtract(b[2:], b[:2]) for b in boxes], axis=0) / 2
+            half = np.median([box[2:] - box[:2] for box in boxes], axis=0) / 2
             u0, v0, u1, v1 = np.concatenate([(box[:2] + box[2:]) / 2 - half, (box[:2] + box[2:]) / 2 + half])
             ready.append(np.array([[u0, v0], [u1, v0], [u1, v1], [u0, v1]]))
         self._candidates = kept
         return ready
+
+
+def _whole(regions: list[tuple[Array, int]]) -> list[tuple[Array, int]]:
+    """Regions one above the other joined to one thing: where it is plain there is no flow to grow through."""
+    regions = list(regions)
+    k = 0
+    while k < len(regions):
+        (one, area), other = regions[k], k + 1
+        while other < len(regions) and not _above(one, regions[other][0]):
+            other += 1
+        if other == len(regions):
+            k += 1
+            continue
+        more, its = regions.pop(other)
+        regions[k] = np.append(np.minimum(one[:2], more[:2]), np.maximum(one[2:], more[2:])), area + its
+        k = 0
+    return regions
+
+
+def _above(box: Array, other: Array) -> bool:
+    across = min(box[2], other[2]) - max(box[0], other[0])
+    gap = max(box[1], other[1]) - min(box[3], other[3])
+    high = max(box[3] - box[1], other[3] - other[1])
+    return bool(across > JOINED * min(box[2] - box[0], other[2] - other[0]) and gap < high)
 
 
 def _shared(box: Array, other: Array) -> float:

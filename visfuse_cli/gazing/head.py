@@ -39,7 +39,9 @@ class Head:
 
     def ground(self, pixels: Array, gaze: Array, height: float) -> Array:
         """World places (..., 2) m at `height` m over the ground under pixels (..., 2); NaN above the horizon."""
-        rays = np.concatenate([(pixels - self.lens.K[:2, 2]) / np.diag(self.lens.K)[:2], np.ones_like(pixels[..., :1])], -1)
+        rays = np.concatenate(
+            [(pixels - self.lens.K[:2, 2]) / np.diag(self.lens.K)[:2], np.ones_like(pixels[..., :1])], -1
+        )
         d = np.linalg.solve(self.P[:, :3], (rays @ self.rotation(gaze).T)[..., None])[..., 0]
         reach = (height - self.centre[2]) / np.where(d[..., 2:] < -1e-9, d[..., 2:], np.nan)
         return np.asarray(self.centre[:2] + reach * d[..., :2])
@@ -47,17 +49,25 @@ class Head:
     def jacobian(self, pixel: Array, gaze: Array, height: float) -> Array:
         """d place / d pixel (2, 2), m/px."""
         steps = STEP * np.eye(2)
-        return np.asarray((self.ground(pixel + steps, gaze, height) - self.ground(pixel - steps, gaze, height)).T / (2 * STEP))
+        return np.asarray(
+            (self.ground(pixel + steps, gaze, height) - self.ground(pixel - steps, gaze, height)).T / (2 * STEP)
+        )
 
     def depth(self, place: Array, height: float) -> float:
         """How far off (m) a place (2,) is."""
         return float(np.linalg.norm(np.append(place, height) - self.centre))
 
 
-def rest(ground: GroundMap, lens: Lens, order: str, source: str) -> Head:
-    """The head behind a gaze homography; raises InputError where that is one of pixels, or no camera fits it."""
-    if ground.input != "gaze":
-        raise InputError(f"{source}: maps pixels; a pan-tilt head needs one from calibrate-homography --gaze")
+def rest(ground: GroundMap, lens: Lens, order: str, source: str, size: tuple[int, int]) -> tuple[GroundMap, Head]:
+    """The map from gaze to ground and the head behind it; raises InputError where no camera fits the homography.
+
+    A homography from pixels is taken as that of the picture at rest, of footage of that `size` (w, h) px.
+    """
+    if ground.input == "pixel":
+        if ground.image_size is not None and ground.image_size != size:
+            made, seen = ("x".join(map(str, each)) for each in (ground.image_size, size))
+            raise InputError(f"{source}: was made for {made} footage, but this is {seen}; calibrate at this size")
+        ground = _by_gaze(ground, (ground.lens or lens).K)
     signs = np.tile(MIRROR, 3)
     mirrored = replace(
         ground,
@@ -66,7 +76,16 @@ def rest(ground: GroundMap, lens: Lens, order: str, source: str) -> Head:
         lens=Lens(np.eye(3), np.zeros(5)),
     )
     camera = ground_camera(mirrored, (2, 2))
-    return Head(camera.image_from_world, camera.centre, lens, order)
+    return ground, Head(camera.image_from_world, camera.centre, lens, order)
+
+
+def _by_gaze(ground: GroundMap, K: Array) -> GroundMap:
+    """A map from pixels as one from the frontal plane's axes, left and up."""
+    image_from_gaze = K * MIRROR
+    J = np.kron(np.eye(3), image_from_gaze.T)  # of the entries, row by row
+    return replace(
+        ground, ground_from_image=ground.ground_from_image @ image_from_gaze, cov=J @ ground.cov @ J.T, input="gaze"
+    )
 
 
 def ground_shift(ground: GroundMap, places: Array) -> Array:

@@ -1,4 +1,4 @@
-"""The motions by speed and course that interact on the ground (Bradshaw 1997, secs 4-5)."""
+"""The motions by speed and course that interact on the ground (Bradshaw 1997, secs. 4.1 and 5)."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Courses:
 
     def start(self, place: Gaussian, velocity: Gaussian) -> Bank:
         """Every motion from a place (2,) and a velocity (2,), equally likely."""
-        speed = float(max(np.linalg.norm(velocity.mean), 1e-3))
+        speed = max(float(np.linalg.norm(velocity.mean)), 1e-3)
         along = velocity.mean / speed
         across = np.array([-along[1], along[0]])
         mean = np.array([*place.mean, speed, np.arctan2(along[1], along[0]), 0.0, 0.0])

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from visfuse_cli.gazing.find import View
 from visfuse_cli.gazing.head import Head
 from visfuse_cli.gazing.models import Courses, combined
 from visfuse_cli.maths import course, imm
@@ -14,11 +15,13 @@ from visfuse_cli.maths.imm import Bank, Step
 from visfuse_cli.moving.settings import ImmConfig
 from visfuse_cli.records import Array, Gaussian
 from visfuse_cli.vision import patches
-from visfuse_cli.vision.patches import Grey, Template
+from visfuse_cli.vision.patches import Alignment, Grey, Template
 
 YOUNG = 6  # measurements from which the first place and velocity are estimated
 GATE = 1 - 1e-6
 TRUST = 4.0  # times an alignment's own covariance
+SEARCH = 0.8  # of its size: how far around the prediction a lost target is looked for
+STRETCH = 0.05  # by which a target's picture may be off the size that its distance gives it
 START_DOUBT = 9.0  # times the covariance of the first place and velocity: the same frames are filtered again
 
 
@@ -36,7 +39,7 @@ class Look:
 
 @dataclass(slots=True)
 class Target:
-    """A target that is followed; `size` (2,) m of what is seen of it; one step of the bank for each look, once begun."""
+    """A target that is followed; `size` (2,) m of what is seen of it; a step of the bank for each look, once begun."""
 
     id: int
     head: Head
@@ -71,42 +74,34 @@ class Target:
 
 
 def start(
-    identity: int,
-    head: Head,
-    config: ImmConfig,
-    models: Courses,
-    levels: list[Grey],
-    quad: Array,
-    look: tuple[int, float, Array],
-    given: bool,
+    identity: int, head: Head, config: ImmConfig, models: Courses, view: View, quad: Array, given: bool
 ) -> Target | None:
-    """Begin with a target in a quad (4, 2) px at look (frame, t, gaze); None where it is not on the ground."""
-    frame, t, gaze = look
-    target = Target(identity, head, config, models, np.ones(2), np.zeros(2), patches.template(levels, quad), given, t)
+    """Begin with a target in a quad (4, 2) px of a view; None where it is not on the ground."""
+    sought = patches.template(view.levels, quad)
+    target = Target(identity, head, config, models, np.ones(2), np.zeros(2), sought, given, view.t)
     at = target.anchor(quad)
-    place = head.ground(at, gaze, target.height)
+    place = head.ground(at, view.gaze, target.height)
     if not np.isfinite(place).all():
         return None
     target.place = place
     target.size = np.array(patches.side(quad)) * head.depth(place, target.height) / np.diag(head.lens.K)[:2]
-    target.looks.append(Look(frame, t, gaze, _box(quad), *_measured(target, at, np.zeros((2, 2)), gaze, None)))
+    measured = _measured(target, at, np.zeros((2, 2)), view.gaze, None)
+    target.looks.append(Look(view.frame, view.t, view.gaze, _box(quad), *measured))
     return target
 
 
-def follow(target: Target, levels: list[Grey], frame: int, t: float, gaze: Array) -> None:
+def follow(target: Target, view: View) -> None:
     """One frame further: predict, look, update."""
-    dt = t - target.looks[-1].t
+    dt = view.t - target.looks[-1].t
     step = target.models.predict(target.steps[-1].filtered, dt) if target.steps else None
     place = combined(step.filtered).mean[:2] if step is not None else target.place
-    quad = target.quad_at(place, gaze)
-    size = levels[0].shape[1], levels[0].shape[0]
-    found = patches.align(levels, quad, target.sought, 0.05) if patches.inside(quad, size, 0) else None
+    quad = target.quad_at(place, view.gaze)
+    found = _look(target, view.levels, quad)
     z, R = None, np.zeros((4, 4))
-    if found is not None and found.correlation >= target.config.measure.good:
-        seen = found.quad(quad)
-        z, R = _measured(target, target.anchor(seen), TRUST * found.cov[:2, :2], gaze, dt)
-        if z is not None:
-            quad = seen
+    if found is not None:
+        seen, alignment = found
+        z, R = _measured(target, target.anchor(seen), TRUST * alignment.cov[:2, :2], view.gaze, dt)
+        quad = seen if z is not None else quad
     if step is not None:
         updated = _updated(step, z, R) if z is not None else None
         if updated is None:
@@ -116,13 +111,31 @@ def follow(target: Target, levels: list[Grey], frame: int, t: float, gaze: Array
             target.nis.append(updated[1])
         target.steps.append(step)
         target.ahead.append(_later(target))
-    target.looks.append(Look(frame, t, gaze, _box(quad), z, R))
-    if z is not None:
-        target.place, target.last_seen = z[:2], t
-        if found is not None and found.correlation < target.config.measure.fresh:
-            target.sought = patches.template(levels, quad)
+    target.looks.append(Look(view.frame, view.t, view.gaze, _box(quad), z, R))
+    if z is not None and found is not None:
+        target.place, target.last_seen = z[:2], view.t
+        if found[1].correlation < target.config.measure.fresh:
+            target.sought = patches.template(view.levels, quad)
     if not target.steps and sum(look.z is not None for look in target.looks) >= YOUNG:
         _begin(target)
+
+
+def _look(target: Target, levels: list[Grey], quad: Array) -> tuple[Array, Alignment] | None:
+    """The quad (4, 2) where the target is seen, near the one that is expected, and how well it fits there."""
+    size = levels[0].shape[1], levels[0].shape[0]
+    good = target.config.measure.good
+    if not patches.inside(quad, size, 0):
+        return None
+    found = patches.align(levels, quad, target.sought, STRETCH)
+    if found is None or found.correlation < good:
+        moved = patches.searched(levels[0], quad, target.sought, SEARCH, good)
+        if moved is None or not patches.inside(moved, size, 0):
+            return None
+        quad = moved
+        found = patches.align(levels, quad, target.sought, STRETCH)
+        if found is None or found.correlation < good:
+            return None
+    return found.quad(quad), found
 
 
 def _measured(target: Target, at: Array, cov: Array, gaze: Array, dt: float | None) -> tuple[Array | None, Array]:

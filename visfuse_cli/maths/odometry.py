@@ -11,6 +11,8 @@ import numpy as np
 
 from visfuse_cli.records import Array
 
+NOISE_S = 0.05  # s for which a wheel's error lasts
+
 
 @dataclass(frozen=True, slots=True)
 class Poses:
@@ -56,33 +58,39 @@ def driven(t: Array, left: Array, right: Array, separation: float, at: Array) ->
     return turned[index], place[index]
 
 
-def from_wheels(
-    t: Array,
-    left: Array,
-    right: Array,
-    separation: float,
-    yaw: float,
-    offset: Array,
-    at: Array,
-    noise: tuple[float, float],
-) -> Poses:
-    """Poses of a camera mounted at `offset` (3,) [right, down, forward] m from the axle's middle, turned by `yaw` rad.
+class Drive:
+    """A drive told by wheel speeds left and right (n,) m/s at t (n,) s; `noise` is their deviation: a share, and m/s.
 
-    noise: deviation of a wheel's speed as a share of it, and in m/s; it makes a random walk of the pose.
+    The noise makes a random walk of the pose, with a memory of NOISE_S.
     """
-    heading, axle = driven(t, left, right, separation, at)
-    vehicle = rotation(heading)
-    R = rotation(heading + yaw)
-    T = axle + vehicle @ offset
-    speed = np.abs(np.interp(at, t, (left + right) / 2))
-    dt = np.diff(at, prepend=at[0])
-    sigma = noise[0] * speed + noise[1]
-    along = np.cumsum(sigma**2 * np.abs(dt) * 0.05)
-    turned = np.cumsum(2 * (sigma / separation) ** 2 * np.abs(dt) * 0.05)
-    cov = np.zeros((len(at), 4, 4))
-    cov[:, range(3), range(3)] = along[:, None] + turned[:, None] * (np.linalg.norm(T - T[0], axis=1)[:, None]) ** 2 / 3
-    cov[:, 3, 3] = turned
-    return Poses(at, R, T, heading + yaw, cov)
+
+    def __init__(self, t: Array, left: Array, right: Array, separation: float, noise: tuple[float, float]) -> None:
+        self._samples = t, left, right
+        self._separation = separation
+        self._heading, self._axle = driven(t, left, right, separation, t)
+        sigma2 = (noise[0] * np.abs(left + right) / 2 + noise[1]) ** 2 * np.diff(t, prepend=t[0]) * NOISE_S
+        self._along, self._turned = np.cumsum(sigma2), np.cumsum(2 * sigma2) / separation**2
+
+    def camera(self, at: Array, yaw: float, offset: Array) -> Poses:
+        """Poses at times `at` (m,) of a camera turned by `yaw` rad to the left of the driving direction.
+
+        It is mounted at `offset` (3,) [right, down, forward] m from the axle's middle.
+        """
+        heading, axle = (np.stack(part) for part in zip(*(self._axle_at(float(now)) for now in at), strict=True))
+        T = axle + rotation(heading) @ offset
+        along, turned = (np.interp(at, self._samples[0], walk) for walk in (self._along, self._turned))
+        cov = np.zeros((len(at), 4, 4))
+        away = np.linalg.norm(axle, axis=1) ** 2
+        cov[:, range(3), range(3)] = (along + turned * away / 3)[:, None]
+        cov[:, 3, 3] = turned
+        return Poses(at, rotation(heading + yaw), T, heading + yaw, cov)
+
+    def _axle_at(self, now: float) -> tuple[Array, Array]:
+        """Heading and place (3,) of the axle: on from the sample before."""
+        k = int(np.clip(np.searchsorted(self._samples[0], now, side="right") - 1, 0, len(self._heading) - 2))
+        t, left, right = (column[k : k + 2] for column in self._samples)
+        turned, moved = driven(t, left, right, self._separation, np.array([now]))
+        return self._heading[k] + turned[0], self._axle[k] + rotation(self._heading[k]) @ moved[0]
 
 
 def from_track(t: Array, x: Array, y: Array, z: Array, theta: Array, pitch: Array, at: Array) -> Poses:

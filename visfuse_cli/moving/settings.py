@@ -99,7 +99,10 @@ class TargetSettings(Section):
     """What is tracked, before a pan-tilt head."""
 
     height: float | None = Field(
-        None, ge=0, le=100, description="m: height over the ground of the box's middle; empty: its lower edge stands on it"
+        None,
+        ge=0,
+        le=100,
+        description="m: height over the ground of the box's middle; empty: its lower edge stands on it",
     )
 
 

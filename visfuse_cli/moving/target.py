@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-import cv2
 import numpy as np
 
 from visfuse_cli.maths import imm
@@ -159,7 +158,7 @@ def _look(target: Target, views: dict[str, list[Grey]], quads: dict[str, Array])
     good = target.config.measure.good
     found = patches.align(views["left"], left, target.sought, 0.2) if patches.inside(left, size, 0) else None
     if found is None or found.correlation < good:
-        moved = _searched(target, views["left"], left)
+        moved = patches.searched(views["left"][0], left, target.sought, SEARCH, good)
         if moved is None or not patches.inside(moved, size, 0):
             return None
         left = moved
@@ -174,29 +173,6 @@ def _look(target: Target, views: dict[str, list[Grey]], quads: dict[str, Array])
     R[:2, :2] = TRUST * found.cov[:2, :2]
     R[2:, 2:] = np.diag(shift[1])
     return left, left + shift[0], R
-
-
-def _searched(target: Target, levels: list[Grey], quad: Array) -> Array | None:
-    """The quad (4, 2) moved to where the template fits best around it, to whole pixels. Jia 2008, eq. 3."""
-    wide, high = patches.side(quad)
-    count = (max(int(wide), 8), max(int(high), 8))
-    level = levels[0]
-    reach = SEARCH * np.array([wide, high])
-    low = np.maximum(np.floor(quad.min(axis=0) - reach), 0).astype(int)
-    top = np.minimum(np.ceil(quad.max(axis=0) + reach), [level.shape[1], level.shape[0]]).astype(int)
-    if np.any(top - low < np.array(count) + 2):
-        return None
-    side = round(np.sqrt(len(target.sought.unit)))
-    across = int(np.sum(target.sought.unit[:, 1] == target.sought.unit[0, 1])) or side
-    picture = target.sought.values.reshape(-1, across).astype(np.float32)
-    wanted = cv2.resize(picture, count, interpolation=cv2.INTER_AREA)
-    window = np.ascontiguousarray(level[low[1] : top[1], low[0] : top[0]])
-    score = cv2.matchTemplate(window, wanted, cv2.TM_CCOEFF_NORMED)
-    _, best, _, at = cv2.minMaxLoc(score)
-    if best < target.config.measure.good:
-        return None
-    moved = low + np.array(at) + (np.array(count) - 1) / 2 - quad.mean(axis=0)
-    return np.asarray(quad + moved)
 
 
 def _measurement(

@@ -10,6 +10,7 @@ from visfuse_cli.records import Array, Image
 LEAST_GRADIENT = 6.0  # grey levels a pixel: below, noise makes any flow
 WEAK = 0.5  # of the seeds' flow: how far a region grows
 CLOSED = 9  # px: gaps within a thing that are closed
+FEWEST, ROUNDS = 200, 8  # px that can tell a shift, and rounds of doing so
 
 
 def normal_flow(before: Image, after: Image, sigma: float) -> tuple[Array, Array]:
@@ -22,7 +23,9 @@ def normal_flow(before: Image, after: Image, sigma: float) -> tuple[Array, Array
     gx, gy = (cv2.Sobel(middle, cv2.CV_32F, *axis, ksize=3, scale=1 / 8) for axis in ((1, 0), (0, 1)))
     square = gx**2 + gy**2
     share = -(second - first) / np.maximum(square, 1e-6)
-    return np.asarray(np.stack([share * gx, share * gy], axis=-1), dtype=float), np.asarray(np.sqrt(square), dtype=float)
+    return np.asarray(np.stack([share * gx, share * gy], axis=-1), dtype=float), np.asarray(
+        np.sqrt(square), dtype=float
+    )
 
 
 def turned(before: Image, R: Array, K: Array) -> tuple[Image, Image]:
@@ -34,9 +37,27 @@ def turned(before: Image, R: Array, K: Array) -> tuple[Image, Image]:
     return np.asarray(seen, np.uint8), np.asarray(cv2.erode(known, np.ones((5, 5), np.uint8)), np.uint8)
 
 
-def grown(flow: Array, gradient: Array, known: Image, least: float) -> list[tuple[Array, int]]:
-    """Boxes [u0, v0, u1, v1] and areas (px) of regions that grow from normal flow of `least` px or more."""
-    speed = np.linalg.norm(flow, axis=-1)
+def steadied(flow: Array, gradient: Array, known: Image) -> Array:
+    """Normal flow (H, W, 2) px less the shift that most of the picture agrees on: what angles are off by."""
+    usable = (gradient > LEAST_GRADIENT) & (known > 0)
+    v = flow[usable]
+    size = np.linalg.norm(v, axis=1)
+    if len(v) < FEWEST:
+        return flow
+    unit = v / np.maximum(size, 1e-9)[:, None]
+    shift, weight = np.zeros(2), np.ones(len(v))
+    for _ in range(ROUNDS):
+        W = unit * weight[:, None]
+        shift = np.linalg.solve(W.T @ unit + 1e-6 * np.eye(2), W.T @ size)
+        off = np.abs(size - unit @ shift)
+        scale = max(1.4826 * float(np.median(off)), 1e-3)
+        weight = 1 / (1 + (off / (2 * scale)) ** 2) ** 2
+    direction = flow / np.maximum(np.linalg.norm(flow, axis=-1, keepdims=True), 1e-9)
+    return np.asarray(flow - (direction @ shift)[..., None] * direction)
+
+
+def grown(speed: Array, gradient: Array, known: Image, least: float) -> list[tuple[Array, int]]:
+    """Boxes [u0, v0, u1, v1] and areas (px) of regions that grow from normal flow (H, W) of `least` px or more."""
     usable = (gradient > LEAST_GRADIENT) & (known > 0)
     seeds = (usable & (speed > least)).astype(np.uint8)
     weak = (usable & (speed > WEAK * least)).astype(np.uint8)

@@ -170,6 +170,27 @@ def align(levels: list[Grey], quad: Array, sought: Template, stretch_sigma: floa
     return Alignment(p[:2], p[2:], np.asarray(np.linalg.pinv(A), dtype=float) * sigma2, correlation)
 
 
+def searched(level: Grey, quad: Array, sought: Template, reach: float, good: float) -> Array | None:
+    """The quad (4, 2) moved to where the template fits best around it, to whole pixels; None where nowhere well.
+
+    `reach` is a share of its sides. Jia 2008, eq. 3.
+    """
+    wide, high = side(quad)
+    count = (max(int(wide), 8), max(int(high), 8))
+    away = reach * np.array([wide, high])
+    low = np.maximum(np.floor(quad.min(axis=0) - away), 0).astype(int)
+    top = np.minimum(np.ceil(quad.max(axis=0) + away), [level.shape[1], level.shape[0]]).astype(int)
+    if np.any(top - low < np.array(count) + 2):
+        return None
+    picture = sought.values.reshape(_count(sought.unit)[::-1]).astype(np.float32)
+    wanted = cv2.resize(picture, count, interpolation=cv2.INTER_AREA)
+    window = np.ascontiguousarray(level[low[1] : top[1], low[0] : top[0]])
+    _, best, _, at = cv2.minMaxLoc(cv2.matchTemplate(window, wanted, cv2.TM_CCOEFF_NORMED))
+    if best < good:
+        return None
+    return np.asarray(quad + low + np.array(at) + (np.array(count) - 1) / 2 - quad.mean(axis=0))
+
+
 def part_values(levels: list[Grey], quads: Array) -> Array:
     """Cell values (P, cells) of the parts of quads (P, 4, 2): 10 parts of 4 x 4 cells, normalised in mean and contrast.
 
