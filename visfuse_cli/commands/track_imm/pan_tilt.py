@@ -43,7 +43,9 @@ class PanTiltRun:
         self.views = {"left": view(folder, "left")}
         calibration = file(folder, FILES, "calibration of the camera (M1, D1)")
         self._lens, stated = read_lens(calibration)
-        path = request.options.get("homography") or file(folder, (HOMOGRAPHY,), "homography from gaze to ground")
+        path = request.options.get("homography") or file(
+            folder, (HOMOGRAPHY,), "homography for the gaze angles of sensors.csv"
+        )
         init, given = named_targets(folder)
         self.files = [each for each in (calibration, sensor_file, path, init) if each is not None]
         source = open_views(self.views, request)["left"]
