@@ -1,6 +1,7 @@
 """The report: everything a run folder holds, on one page that needs no network."""
 
 import json
+import os
 import re
 import subprocess
 import sys
@@ -10,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.chromium import page
 from visfuse_cli import report
 from visfuse_cli.errors import InputError
 from visfuse_cli.files.spool import TrackSpool
@@ -64,10 +66,10 @@ def test_a_run_ends_with_a_page_that_needs_nothing_else(run):
     assert text.count("<svg") == 2
     assert "data:video/mp4" in text
     assert "data:image/png" in text  # the calibration's picture
-    for word in ("50th percentile", "Rejected", "normalised innovation squared", "How it was made"):
+    for word in ("50th percentile", "Rejected", "Normalised innovation squared", "How it was made"):
         assert word in text
     tracks = json.loads(re.search(r'class="tracks">(.*?)</script>', text, re.DOTALL)[1])
-    assert {track["id"] for track in tracks} == {
+    assert {track["id"] for track in tracks["tracks"]} == {
         t["id"] for t in json.loads((run / "tracks.json").read_text())["tracks"]
     }
 
@@ -83,7 +85,7 @@ def test_several_runs_share_a_page(run, tmp_path):
     assert (tmp_path / "both.html").read_text(encoding="utf-8").count("<section") == 2
 
 
-def test_a_run_of_a_moving_camera_has_a_page(tmp_path):
+def _moving_run(folder):
     """Tracks in 3D without tables or video, with several motion models."""
     states = [
         {
@@ -99,17 +101,82 @@ def test_a_run_of_a_moving_camera_has_a_page(tmp_path):
         for k in range(30)
     ]
     summary = {"t_start": 0.0, "t_end": 2.9, "n_frames": 30, "distance": 6.5, "speed": 2.2, "speed_ci95": [2.1, 2.3]}
-    with TrackSpool(tmp_path, "track-imm", 0, "left-camera-at-start") as tracks:
+    with TrackSpool(folder, "track-imm", 0, "left-camera-at-start") as tracks:
         tracks.add({"id": 1, "summary": summary, "states": states})
     document = {
         **{"command": "track-imm", "version": "1", "finished": "now", "seed": 0, "stopped_by": None},
         **{"command_line": [], "inputs": [], "versions": {}, "warnings": ["</script><b>"], "time_audit": {}},
     }
-    (tmp_path / "run.json").write_text(json.dumps(document))
+    (folder / "run.json").write_text(json.dumps(document))
+
+
+def test_a_run_of_a_moving_camera_has_a_page(tmp_path):
+    _moving_run(tmp_path)
     text = report.write([tmp_path]).read_text(encoding="utf-8")
     assert "Motion models of track 1" in text
     assert "</script><b>" not in text
     assert _page(tmp_path / "report.html").rows == 1
+
+
+def test_what_is_too_large_to_embed_is_linked(run, tmp_path, monkeypatch):
+    monkeypatch.setattr(report.page, "EMBEDDED_BYTES", 1000)
+    text = report.write([run], tmp_path / "linked.html").read_text(encoding="utf-8")
+    assert "data:video/mp4" not in text
+    assert f'src="{os.path.relpath(run / "annotated.mp4", tmp_path)}"' in text
+
+
+def test_in_a_browser_a_click_seeks_and_heads_sort(run):
+    with page(1280, 900) as window:
+        window.goto((run / "report.html").as_uri())
+        row = window.locator("tr[data-seek]").nth(1)
+        wanted = float(row.get_attribute("data-seek"))
+        row.locator("button").focus()
+        window.keyboard.press("Enter")  # no mouse is needed
+        window.wait_for_function(f"Math.abs(document.querySelector('video').currentTime - {wanted}) < 0.05")
+        assert "chosen" in row.get_attribute("class")
+        window.wait_for_function("document.querySelectorAll('.speeds g.chosen').length > 0")
+        assert (
+            window.evaluate("getComputedStyle(document.querySelector('.speeds g[class^=track-]:not(.chosen)')).opacity")
+            < "1"
+        )
+
+        speed = window.locator("table.sortable").first.locator("th button", has_text="speed")
+        cells = (
+            "[...document.querySelector('table.sortable').tBodies[0].rows].map(row => Number(row.cells[4].textContent))"
+        )
+        for sign in (1, -1):
+            speed.click()
+            shown = window.evaluate(cells)
+            assert shown == sorted(shown, reverse=sign < 0)
+            assert len(shown) > 1
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_on_a_phone_nothing_sticks_out(run, scheme):
+    with page(390, 844, color_scheme=scheme) as window:
+        window.goto((run / "report.html").as_uri())
+        assert window.evaluate("document.documentElement.scrollWidth <= innerWidth")
+        ink, paper = (
+            window.evaluate(f"getComputedStyle(document.body).{name}") for name in ("color", "backgroundColor")
+        )
+        light, dark = (
+            sum(map(int, re.findall(r"\d+", colour)[:3]))
+            for colour in ((paper, ink) if scheme == "light" else (ink, paper))
+        )
+        assert light - dark > 400
+        assert window.evaluate("getComputedStyle(document.querySelector('.plot text')).fill") == ink
+
+
+def test_without_a_video_the_map_has_a_clock_of_its_own(tmp_path):
+    _moving_run(tmp_path)
+    report.write([tmp_path])
+    with page(1000, 800) as window:
+        window.goto((tmp_path / "report.html").as_uri())
+        window.locator("tr[data-seek] button").first.click()
+        assert window.locator("output").inner_text() == "0.0 s"
+        window.click("text=Play")
+        window.wait_for_function("parseFloat(document.querySelector('output').textContent) > 0.2")
+        window.click("text=Pause")
 
 
 def test_what_is_no_run_is_refused(tmp_path):

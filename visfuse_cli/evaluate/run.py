@@ -8,14 +8,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
-from scipy.stats import chi2
 
 from visfuse_cli.evaluate.tables import TRUTH, Estimates, read_run, read_table
 from visfuse_cli.files.atomic import write_json
+from visfuse_cli.maths.consistency import innovations, verdict
 from visfuse_cli.records import Array
 
 Z95 = 1.959963984540054
-BAND = 0.999  # probability inside the bands of the consistency tests
 NEAR_S = 2.0  # s between a vehicle and the reading of a radar that may be of it
 
 
@@ -26,7 +25,11 @@ def evaluate(folder: Path, truth: Path | None, reference: Path | None, gate: flo
     InputError where a file cannot be read, OutputError where the result cannot be written.
     """
     run = read_run(folder)
-    found: dict[str, Any] = {"schema": "visfuse.evaluation/1", "run": str(folder), "consistency": _innovations(run)}
+    found: dict[str, Any] = {
+        "schema": "visfuse.evaluation/1",
+        "run": str(folder),
+        "consistency": innovations(run.summaries),
+    }
     if truth is not None:
         found["truth"] = str(truth)
         found |= _against_truth(run, read_table(truth, TRUTH[:5], TRUTH[5:]), gate, plane)
@@ -35,24 +38,6 @@ def evaluate(folder: Path, truth: Path | None, reference: Path | None, gate: flo
         found["speeds"] = _against_radar(run, read_table(reference, ("t", "speed_kmh")))
     write_json(folder / "evaluation.json", found)
     return found
-
-
-def _innovations(run: Estimates) -> dict[str, Any] | None:
-    """The normalised innovations of all tracks together, where the run tells them."""
-    told = [
-        (s["nis_mean"], s["n_frames"], s["nis_dof"]) for s in run.summaries if s.get("nis_mean") and s.get("nis_dof")
-    ]
-    if not told:
-        return None
-    mean, count, size = np.array(told, dtype=float).T
-    freedom = float((count * size).sum())
-    return _verdict(float((mean * count).sum()) / freedom, freedom)
-
-
-def _verdict(ratio: float, freedom: float) -> dict[str, Any]:
-    low, high = (float(chi2.ppf(p, freedom)) / freedom for p in ((1 - BAND) / 2, (1 + BAND) / 2))
-    word = "consistent" if low <= ratio <= high else ("cautious" if ratio < low else "too sure of itself")
-    return {"per_degree_of_freedom": ratio, "band": [low, high], "verdict": word}
 
 
 def _against_truth(run: Estimates, truth: dict[str, Array], gate: float, plane: bool) -> dict[str, Any]:
@@ -88,7 +73,7 @@ def _against_truth(run: Estimates, truth: dict[str, Array], gate: float, plane: 
         nees = np.einsum("ni,ni->n", off, np.linalg.solve(cov, off[..., None])[..., 0])
         tracks = len(np.unique(run.id[mine]))
         # The errors of one track go together: each track is one draw, not each of its states.
-        result["nees"] = _verdict(float(nees.mean()) / size, float(size * tracks))
+        result["nees"] = verdict(float(nees.mean()) / size, float(size * tracks))
     return result | _identities(run, truth, place, gate, size, frames)
 
 

@@ -11,6 +11,8 @@ from typing import Any
 import numpy as np
 
 from visfuse_cli.errors import InputError
+from visfuse_cli.files.lanes_file import read_lanes
+from visfuse_cli.maths.polygons import Polygon
 from visfuse_cli.records import Array
 
 
@@ -31,7 +33,7 @@ class TrackView:
 
 @dataclass(frozen=True, slots=True)
 class RunView:
-    """One run: its document, tracks, tables, videos by clip or view, and the calibration picture if there is one."""
+    """One run: its document, tracks, tables, videos by clip or view, calibration picture and lanes if there are any."""
 
     folder: Path
     document: dict[str, Any]
@@ -41,6 +43,7 @@ class RunView:
     rejected: list[dict[str, str]]
     videos: dict[str, Path]
     calibration: Path | None
+    lanes: tuple[Polygon, ...]
 
 
 def read(folder: Path) -> RunView:
@@ -63,6 +66,7 @@ def read(folder: Path) -> RunView:
         rejected=_table(folder / "rejected.csv"),
         videos=_videos(folder),
         calibration=picture if picture.is_file() else None,
+        lanes=(read_lanes(lanes) or ()) if (lanes := folder / "lanes.yaml").is_file() else (),
     )
 
 
@@ -104,6 +108,9 @@ def _track(track: dict[str, Any]) -> TrackView:
 
 
 def _videos(folder: Path) -> dict[str, Path]:
-    """Annotated videos by what follows `annotated-`; a single one is called nothing."""
-    found = sorted(folder.glob("annotated*.mp4"))
-    return {path.stem.removeprefix("annotated").removeprefix("-"): path for path in found}
+    """Annotated videos by what follows `annotated-`; a single one is called nothing. All cameras at once come first."""
+    found = {
+        path.stem.removeprefix("annotated").removeprefix("-"): path for path in sorted(folder.glob("annotated*.mp4"))
+    }
+    mosaic = folder / "mosaic.mp4"
+    return ({"all cameras": mosaic} if mosaic.is_file() else {}) | found
