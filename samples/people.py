@@ -2,29 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
 
 import numpy as np
 from scipy.interpolate import PchipInterpolator
 
+from samples.figures import FIGURES, Colour, Piece, Stance
 from samples.scene import Array, Camera
 
-Colour = tuple[float, float, float]
 STEP_M = 0.7
 """Metres: length of a step; the limbs swing with the way that is walked."""
-
-
-@dataclass(frozen=True, slots=True)
-class Part:
-    """A capsule from a to b (3,) m with radii m, colour BGR."""
-
-    a: Array
-    b: Array
-    radius_a: float
-    radius_b: float
-    colour: Colour
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,51 +27,40 @@ class Walker:
     trousers: Colour
     times: Array
     knots: Array
-    jointed: bool = True
+    figure: str = "jointed"
+    straight: bool = False
 
     def states(self, t: Array) -> Array:
         """x, y, vx, vy (n, 4) at times t (n,)."""
-        curve = PchipInterpolator(self.times, self.knots)
-        # Pchip stands still where two knots are one; averaging over half a second rounds its corners.
+        curve = (PchipInterpolator, _Polyline)[self.straight](self.times, self.knots)
+        # Pchip stands still where two knots are one; averaging over half a second rounds its and a polyline's corners.
         lags = np.linspace(-0.25, 0.25, 11)
         when = np.clip(t[:, None] + lags, self.times[0], self.times[-1])
         return np.column_stack([curve(when).mean(axis=1), curve.derivative()(when).mean(axis=1)])
 
-    def parts(self, state: Array, heading: float, way: float) -> list[Part]:
-        """The body at one state (4,), facing `heading` rad, after `way` m of walk; a pillar where it is not jointed."""
-        h = self.height
+    def pieces(self, state: Array, heading: float, way: float) -> list[Piece]:
+        """The body at one state (4,), facing `heading` rad, after `way` m of walk."""
         pace = min(float(np.hypot(*state[2:])) / 1.2, 1.0)
-        swing = 0.32 * pace * np.sin(np.pi * way / STEP_M)
-        ahead = np.array([np.cos(heading), np.sin(heading), 0.0])
-        left = np.array([-ahead[1], ahead[0], 0.0])
+        swing = pace * float(np.sin(np.pi * way / STEP_M))
         foot = np.array([state[0], state[1], 0.0])
+        stance = Stance(foot, heading, self.height, swing, self.skin, self.shirt, self.trousers)
+        return FIGURES[self.figure](stance)
 
-        def at(forward: float, side: float, up: float) -> Array:
-            return np.asarray(foot + forward * ahead + side * left + np.array([0, 0, up]))
 
-        if not self.jointed:
-            return [
-                Part(at(0, 0, 0.12 * h), at(0, 0, 0.5 * h), 0.12 * h, 0.12 * h, self.trousers),
-                Part(at(0, 0, 0.5 * h), at(0, 0, 0.72 * h), 0.12 * h, 0.12 * h, self.shirt),
-                Part(at(0, 0, 0.92 * h), at(0, 0, 0.91 * h), 0.08 * h, 0.08 * h, self.skin),
-            ]
-        hip, shoulder = 0.5 * h, 0.8 * h
-        parts = [
-            Part(at(0, 0, hip), at(0, 0, shoulder - 0.02 * h), 0.09 * h, 0.1 * h, self.shirt),
-            Part(at(0, 0.05 * h, 0.79 * h), at(0, -0.05 * h, 0.79 * h), 0.06 * h, 0.06 * h, self.shirt),
-            Part(at(0, 0, 0.935 * h), at(0, 0, 0.925 * h), 0.065 * h, 0.065 * h, self.skin),
-        ]
-        for side in (1.0, -1.0):
-            reach = side * swing * 0.5 * h
-            knee = at(0.6 * reach, side * 0.05 * h, 0.27 * h)
-            ankle = at(reach, side * 0.05 * h, 0.035 * h)
-            parts.append(Part(at(0, side * 0.05 * h, hip), knee, 0.055 * h, 0.042 * h, self.trousers))
-            parts.append(Part(knee, ankle, 0.042 * h, 0.032 * h, self.trousers))
-            parts.append(Part(ankle, at(reach + 0.08 * h, side * 0.05 * h, 0.02 * h), 0.03 * h, 0.02 * h, (40, 40, 45)))
-            hand = at(-0.8 * reach, side * 0.14 * h, 0.46 * h)
-            parts.append(Part(at(0, side * 0.115 * h, 0.79 * h), hand, 0.032 * h, 0.026 * h, self.shirt))
-            parts.append(Part(hand, hand - [0, 0, 0.03 * h], 0.028 * h, 0.02 * h, self.skin))
-        return parts
+class _Polyline:
+    """Straight and steady from knot to knot."""
+
+    def __init__(self, times: Array, knots: Array) -> None:
+        self._times, self._knots = times, knots
+        self._speeds = np.diff(knots, axis=0) / np.diff(times)[:, None]
+
+    def __call__(self, t: Array) -> Array:
+        return np.stack([np.interp(t, self._times, column) for column in self._knots.T], axis=-1)
+
+    def derivative(self) -> Callable[[Array], Array]:
+        """The velocities."""
+        last = len(self._speeds) - 1
+        return lambda t: self._speeds[(np.searchsorted(self._times, t, side="right") - 1).clip(0, last)]
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,6 +75,9 @@ class Yard:
     seed: int
     noise: float = 2.5
     sun: tuple[float, float, float] | None = (0.45, 0.3, 0.84)
+    contrast: float = 1.0
+    """Of the floor's and walls' pattern."""
+    ground: Colour = (125.0, 135.0, 140.0)
     ground_z: float = 0.0
     """Metres: the height of the ground in the world of the calibration."""
 
@@ -120,7 +101,9 @@ def crossing(
     size: tuple[int, int] = (640, 480),
     fps: Fraction = Fraction(20),
     stand_s: float = 0.0,
-    jointed: bool = True,
+    figure: str = "jointed",
+    far: tuple[float, float] = (5.5, 8.0),
+    high: tuple[float, float] = (2.0, 4.5),
 ) -> Yard:
     """People who come from different sides, cross in the middle within a second and go on; cameras all around."""
     rng = np.random.default_rng((seed, 7))
@@ -128,14 +111,40 @@ def crossing(
     views = {}
     for k in range(cameras):
         angle = turn + 2 * np.pi * (k + rng.uniform(-0.2, 0.2)) / cameras
-        far, high = rng.uniform(5.5, 8.0), rng.uniform(2.0, 4.5)
-        centre = np.array([far * np.cos(angle), far * np.sin(angle), high])
+        away, up = rng.uniform(*far), rng.uniform(*high)
+        centre = np.array([away * np.cos(angle), away * np.sin(angle), up])
         # wide enough that a person at the yard's edge stays in the picture
-        focal = size[0] / 2 / np.tan(np.arctan2(3.6, far)) * rng.uniform(0.85, 1.1)
+        focal = size[0] / 2 / np.tan(np.arctan2(3.6, away)) * rng.uniform(0.85, 1.1)
         views[f"cam{k + 1}"] = looking_at(centre, np.array([0, 0, 0.8]), focal, size, rng.normal(0, 0.03))
-    walkers = [replace(walker, jointed=jointed) for walker in _walkers(rng, people, seconds, stand_s)]
+    walkers = [replace(walker, figure=figure) for walker in _walkers(rng, people, seconds, stand_s)]
     names = list(views)
     return Yard(views, dict.fromkeys(names, fps), dict.fromkeys(names, 0.0), tuple(walkers), seconds, seed)
+
+
+def varied(seed: int, seconds: float = 12.0) -> Yard:
+    """The crossing with bodies, walks, heights, cameras, light, ground and noise drawn by lot."""
+    rng = np.random.default_rng((seed, 13))
+    size = ((640, 480), (640, 480), (800, 450), (512, 384))[int(rng.integers(4))]
+    yard = crossing(seed + 1000, seconds, size=size, far=(4.5, 9.0), high=(1.6, 6.5))
+    figure, straight = str(rng.choice(list(FIGURES))), bool(rng.uniform() < 0.5)
+    grey = bool(rng.uniform() < 0.25)
+    walkers = []
+    for walker in yard.walkers:
+        height = float(rng.uniform(1.55, 1.95))
+        shirt, trousers = (_grey(c) if grey else c for c in (walker.shirt, walker.trousers))
+        dressed = replace(walker, shirt=shirt, trousers=trousers)
+        walkers.append(replace(dressed, height=height, figure=figure, straight=straight))
+    high = rng.uniform(0.5, 0.9)
+    sun = (float(rng.normal(0, 0.4)), float(rng.normal(0, 0.4)), float(high)) if rng.uniform() < 0.6 else None
+    tone = rng.uniform(60, 190) + rng.normal(0, 12, 3)
+    return replace(
+        yard,
+        walkers=tuple(walkers),
+        sun=sun,
+        noise=float(rng.choice([0.0, 1.5, 4.0])),
+        contrast=float(rng.choice([0.0, 0.3, 1.0])),
+        ground=(float(tone[0]), float(tone[1]), float(tone[2])),
+    )
 
 
 def _walkers(rng: np.random.Generator, people: int, seconds: float, stand_s: float) -> list[Walker]:
@@ -171,6 +180,11 @@ def _clear(walker: Walker, others: Sequence[Walker], seconds: float) -> bool:
     t = np.arange(0, seconds, 0.1)
     path = walker.states(t)[:, :2]
     return all(np.linalg.norm(path - other.states(t)[:, :2], axis=1).min() > 0.55 for other in others)
+
+
+def _grey(colour: Colour) -> Colour:
+    mean = sum(colour) / 3
+    return mean, mean, mean
 
 
 def _colour(hue: float, saturation: float, value: float) -> Colour:

@@ -10,13 +10,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from samples.figures import Piece
 from samples.files import write_clip
-from samples.people import Part, Yard
+from samples.people import Yard
 from samples.scene import Array, Camera
 
 Image = NDArray[np.uint8]
-RING = np.linspace(0, 2 * np.pi, 14, endpoint=False)
-CIRCLE = np.column_stack([np.cos(RING), np.sin(RING)])
 FLOOR_M, FLOOR_PX = 24.0, 60
 """Side of the painted floor in metres, and pixels a metre of it."""
 SHADE = 0.55
@@ -70,14 +69,14 @@ def frames(yard: Yard, name: str) -> Iterator[Image]:
     states = [walker.states(t) for walker in yard.walkers]
     ways = [_ways(walker.states(np.arange(0, yard.seconds + yard.delays[name] + 1, 0.02))) for walker in yard.walkers]
     for k in range(len(t)):
-        bodies = []
+        pieces: list[Piece] = []
         for walker, state, (way, heading) in zip(yard.walkers, states, ways, strict=True):
             at = min(int(t[k] / 0.02), len(way) - 1)
-            bodies.append(walker.parts(state[k], heading[at], way[at]))
+            pieces += walker.pieces(state[k], heading[at], way[at])
         picture = empty.copy()
         if yard.sun is not None:
-            _shade(picture, camera, bodies, np.array(yard.sun))
-        _draw(picture, camera, [part for body in bodies for part in body])
+            _shade(picture, camera, pieces, np.array(yard.sun))
+        _draw(picture, camera, pieces)
         noise = rng.normal(0, yard.noise, picture.shape)
         yield np.clip(np.rint(picture + noise), 0, 255).astype(np.uint8)
 
@@ -95,16 +94,19 @@ def _empty(yard: Yard, camera: Camera, index: int) -> Image:
     """The yard without people: a patched floor, and walls beyond."""
     rng = np.random.default_rng((yard.seed, 3))
     side = int(FLOOR_M * FLOOR_PX)
-    patches = rng.normal(0, 16, (24, 24, 1)) + rng.normal(0, 6, (24, 24, 3)) + np.array([125.0, 135.0, 140.0])
+    patches = rng.normal(0, 16, (24, 24, 1)) + rng.normal(0, 6, (24, 24, 3))
     floor = cv2.resize(patches, (side, side), interpolation=cv2.INTER_NEAREST)
     floor += cv2.GaussianBlur(rng.normal(0, 26, (side, side, 1)).astype(np.float32), (5, 5), 0)[..., None]
+    floor = yard.contrast * floor + np.array(yard.ground)
     to_floor = np.array([[1 / FLOOR_PX, 0, -FLOOR_M / 2], [0, 1 / FLOOR_PX, -FLOOR_M / 2], [0, 0, 1]])
     image_from_floor = camera.image_from_ground() @ to_floor
     wide, high = camera.size
     walls = np.random.default_rng((yard.seed, 5, index))
-    blocks = walls.normal(0, 25, (6, 8, 3)) + np.array([150.0, 140.0, 130.0])
+    blocks = yard.contrast * walls.normal(0, 25, (6, 8, 3)) + np.array([150.0, 140.0, 130.0])
     picture = cv2.resize(blocks.astype(np.float32), (wide, high), interpolation=cv2.INTER_LINEAR)
-    picture += cv2.GaussianBlur(walls.normal(0, 18, (high, wide, 1)).astype(np.float32), (5, 5), 0)[..., None]
+    picture += (
+        yard.contrast * cv2.GaussianBlur(walls.normal(0, 18, (high, wide, 1)).astype(np.float32), (5, 5), 0)[..., None]
+    )
     u, v = np.meshgrid(np.arange(wide), np.arange(high))
     floor_from_image = np.linalg.inv(image_from_floor)
     depth = floor_from_image[2, 0] * u + floor_from_image[2, 1] * v + floor_from_image[2, 2]
@@ -116,39 +118,26 @@ def _empty(yard: Yard, camera: Camera, index: int) -> Image:
     return np.clip(picture * (1 - covered) + laid * covered, 0, 255).astype(np.uint8)
 
 
-def _outline(camera: Camera, part: Part) -> Array:
-    """The convex outline (n, 2) px of a capsule."""
-    ends = np.stack([part.a, part.b])
-    radius = np.array([part.radius_a, part.radius_b]) * camera.K[0, 0] / camera.depth(ends)
-    rings = camera.project(ends)[:, None] + radius[:, None, None] * CIRCLE
-    return np.asarray(cv2.convexHull(rings.reshape(-1, 2).astype(np.float32)).reshape(-1, 2), dtype=float)
-
-
 def _fill(picture: NDArray[np.uint8], outline: Array, colour: tuple[float, ...]) -> None:
     points = np.rint(np.clip(outline, -2000, 4000) * 16).astype(np.int32)
     cv2.fillConvexPoly(picture, points, colour, cv2.LINE_AA, 4)
 
 
-def _draw(picture: Image, camera: Camera, parts: list[Part]) -> None:
-    """Bodies, far parts first; each lighter to its upper left."""
-    seen = [part for part in parts if camera.depth(np.stack([part.a, part.b])).min() > 0.5]
-    for part in sorted(seen, key=lambda p: -float(camera.depth(((p.a + p.b) / 2)[None])[0])):
-        outline = _outline(camera, part)
-        _fill(picture, outline, part.colour)
+def _draw(picture: Image, camera: Camera, pieces: list[Piece]) -> None:
+    """Bodies, far pieces first; each lighter to its upper left."""
+    far = [(camera.depth(piece.ends()), piece) for piece in pieces]
+    for _, piece in sorted(((d.mean(), piece) for d, piece in far if d.min() > 0.5), key=lambda pair: -pair[0]):
+        outline = piece.outline(camera)
+        _fill(picture, outline, piece.colour)
         middle = outline.mean(axis=0)
-        light = tuple(min(255.0, 1.15 * c + 8) for c in part.colour)
+        light = tuple(min(255.0, 1.15 * c + 8) for c in piece.colour)
         _fill(picture, middle + 0.55 * (outline - middle) - 0.15 * np.ptp(outline, axis=0), light)
 
 
-def _shade(picture: Image, camera: Camera, bodies: list[list[Part]], sun: Array) -> None:
+def _shade(picture: Image, camera: Camera, pieces: list[Piece], sun: Array) -> None:
     """Darken the floor where a body keeps the sun off."""
     mask = np.zeros(picture.shape[:2], np.uint8)
-    for part in (part for body in bodies for part in body):
-        rings = []
-        for end, radius in ((part.a, part.radius_a), (part.b, part.radius_b)):
-            ring = end + radius * np.column_stack([CIRCLE, np.zeros(len(CIRCLE))])
-            rings.append(ring - ring[:, 2:] * sun / sun[2])
-        cast = np.concatenate(rings)
+    for cast in (piece.cast(sun) for piece in pieces):
         if camera.depth(cast).min() > 0.5:
             _fill(mask, cv2.convexHull(camera.project(cast).astype(np.float32)).reshape(-1, 2), (255,))
     soft = cv2.GaussianBlur(mask, (5, 5), 0).astype(np.float32)[..., None] / 255

@@ -123,15 +123,16 @@ class View:
 class Sighting:
     """One person in one camera at one instant: the tracked point z (2,) px without distortion, its noise R (2, 2).
 
-    box (4,) px as the picture shows it, and `seen`, the share of the person that is (0 to 1); `dt` (s) from the
-    instant of the set to the camera's own.
+    box (4,) px as the picture shows it; `dt` (s) from the instant of the set to the camera's own. `lever` (3,) says how
+    many m z moves up the body for each m that is added to height, head and feet, and `assumed` (m) what of it is in z.
     """
 
     z: Array
     R: Array
     box: Array
     dt: float = 0.0
-    seen: float = 1.0
+    lever: Array = field(default_factory=lambda: np.zeros(3))
+    assumed: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)

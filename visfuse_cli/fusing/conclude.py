@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from visfuse_cli.fusing.estimate import Sights, at_one_time, fuse, pair_up
 from visfuse_cli.fusing.noise import disagreement, restlessness
-from visfuse_cli.fusing.person import BOX, DT, VARIANCE, Person, Z
+from visfuse_cli.fusing.person import ASSUMED, BOX, DT, LEVER, VARIANCE, Person, Z
 from visfuse_cli.fusing.settings import FuseConfig
 from visfuse_cli.fusing.tracker import motion
 from visfuse_cli.maths import fusion, fusion_rivals, gaussian
@@ -63,7 +63,7 @@ def conclude(person: Person, P: Array, config: FuseConfig) -> Path | None:
     if t[pairs[-1]] - t[pairs[0]] < config.life.min_duration_s - 1e-9:
         return None
     state = person.history.state
-    sights = _sights(rows, seen, state, P)
+    sights, lever = _sights(rows, seen, state, P, person.body.ends.mean)
     noise, sigma_a = 1.0, config.filter.sigma_a
     belief = _filtered(person, sights, P, t, state, config, noise, sigma_a)
     pixels, J = project(P[sights.camera], belief.mean[sights.owner, :3])
@@ -74,7 +74,7 @@ def conclude(person: Person, P: Array, config: FuseConfig) -> Path | None:
         belief = _filtered(person, sights, P, t, state, config, noise, sigma_a)
         pixels, J = project(P[sights.camera], belief.mean[sights.owner, :3])
     cov = belief.cov.copy()
-    cov[:, :3, :3] += BODY_SIGMA**2 * noise * np.eye(3)
+    cov[:, :3, :3] += BODY_SIGMA**2 * noise * np.eye(3) + _by_body(sights, J, lever, person.body.ends.cov, len(t))
     belief = Gaussian(belief.mean, cov)
     residual = np.full((*seen.shape, 2), np.nan)
     residual[sights.owner, sights.camera] = sights.z - pixels
@@ -88,7 +88,7 @@ def conclude(person: Person, P: Array, config: FuseConfig) -> Path | None:
         residual=residual,
         weight=_weights(sights, J, seen.shape),
         told=seen.any(axis=1) | (np.array(person.history.denied) < DENIED),
-        height=person.body.height.mean,
+        height=person.body.ends.height,
         noise=noise,
         sigma_a=sigma_a,
         refused=person.refused,
@@ -96,14 +96,32 @@ def conclude(person: Person, P: Array, config: FuseConfig) -> Path | None:
     )
 
 
-def _sights(rows: Array, seen: NDArray[np.bool_], state: Array, P: Array) -> Sights:
-    """All sightings of a track, the instants as owners, brought to the instants of the sets."""
+def _sights(rows: Array, seen: NDArray[np.bool_], state: Array, P: Array, ends: Array) -> tuple[Sights, Array]:
+    """All sightings of a track, the instants as owners, brought to the instants of the sets; and their levers (M, 3).
+
+    The body's `ends` (3,) m as known at the end take the place of what was assumed at the time.
+    """
     owner, camera = np.nonzero(seen)
     own = rows[owner, camera]
+    lever = own[:, LEVER]
+    _, J = project(P[camera], state[owner, :3])
+    z = own[:, Z] + J[:, :, 2] * (lever @ ends - own[:, ASSUMED])[:, None]
     a, b, c = own[:, VARIANCE].T
     R = np.stack([np.stack([a, b], axis=-1), np.stack([b, c], axis=-1)], axis=-2)
-    sights = Sights(owner, camera, own[:, Z], R, own[:, DT])
-    return at_one_time(sights, P, Gaussian(state, np.zeros((len(state), 6, 6))))
+    sights = Sights(owner, camera, z, R, own[:, DT])
+    return at_one_time(sights, P, Gaussian(state, np.zeros((len(state), 6, 6)))), lever
+
+
+def _by_body(sights: Sights, J: Array, lever: Array, ends: Array, count: int) -> Array:
+    """Covariances (count, 3, 3) of the positions that come from the doubt of the body's ends (3, 3): one for all."""
+    J_W = np.swapaxes(J, -1, -2) @ np.linalg.inv(sights.R)
+    information, push = np.tile(np.eye(3), (count, 1, 1)), np.zeros((count, 3, 3))
+    np.add.at(information, sights.owner, J_W @ J)
+    np.add.at(push, sights.owner, (J_W @ J[:, :, 2:]) * lever[:, None])
+    moved = np.asarray(np.linalg.solve(information, push), dtype=float)
+    seen = np.bincount(sights.owner, minlength=count) >= 2
+    moved[~seen] = moved[seen].mean(axis=0) if seen.any() else 0.0
+    return moved @ ends @ np.swapaxes(moved, -1, -2)
 
 
 def _filtered(

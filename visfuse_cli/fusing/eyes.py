@@ -121,6 +121,7 @@ class PictureEyes:
         self.open = np.isin(np.arange(len(self._names)), list(found))
         self._dt = {camera: frame.t - instant.t for camera, frame in found.items()}
         list(self._pool.map(lambda pair: self._cameras[pair[0]].look(pair[1].image), found.items()))
+        self._watch.settle(list(found))
 
     def alone(self, camera: int, frame: Frame) -> Array:
         """Where on the ground (k, 2) m what moves in one camera's frame alone puts people."""

@@ -7,12 +7,13 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from visfuse_cli.fusing.body import Body
 from visfuse_cli.maths.fusion_rivals import Bank
 from visfuse_cli.records import Array, Gaussian, Sighting
 
 Z, VARIANCE, BOX, DT = slice(0, 2), slice(2, 5), slice(5, 9), 9  # columns of History.rows
-COLUMNS = 10
-HALF_SHARE = 0.33  # half of the usual row's width, as a share of the box's
+LEVER, ASSUMED = slice(10, 13), 13
+COLUMNS = 14
 
 
 class History:
@@ -30,11 +31,12 @@ class History:
         return len(self.t)
 
     def add(self, frame: int, t: float, state: Array, sightings: dict[int, Sighting]) -> None:
-        """Keep one instant: the person's position and velocity (6,) as then believed, and the sightings by camera."""
+        """Keep one instant: position and velocity (6,) as then believed, and the sightings by camera."""
         rows = np.full((self._cameras, COLUMNS), np.nan)
         for camera, sight in sightings.items():
             rows[camera, Z], rows[camera, BOX], rows[camera, DT] = sight.z, sight.box, sight.dt
             rows[camera, VARIANCE] = sight.R[0, 0], sight.R[0, 1], sight.R[1, 1]
+            rows[camera, LEVER], rows[camera, ASSUMED] = sight.lever, sight.assumed
         self.frame.append(frame)
         self.t.append(t)
         self.denied.append(0)
@@ -55,33 +57,6 @@ class History:
         """Forget what came after the first `length` instants."""
         del self.frame[length:], self.t[length:], self.denied[length:], self._state[6 * length :]
         del self._rows[length * self._cameras * COLUMNS :]
-
-
-@dataclass(slots=True)
-class Scale:
-    """A length of the body that is learnt: mean (m) and how many looks stand behind it."""
-
-    mean: float
-    looks: float
-
-    def learn(self, value: float, weight: float = 1.0, longest: float = 400.0) -> None:
-        """Take in one look."""
-        self.looks = min(self.looks + weight, longest)
-        self.mean += (value - self.mean) * weight / self.looks
-
-
-@dataclass(slots=True)
-class Body:
-    """What is known of somebody's measures: height, width of the whole box, and half the width of the usual row, m."""
-
-    height: Scale
-    width: Scale
-    half: Scale
-
-
-def usual_body(height: float, width: float, looks: float) -> Body:
-    """A body of usual measures that count for so many looks."""
-    return Body(Scale(height, looks), Scale(width, looks), Scale(HALF_SHARE * width, looks))
 
 
 @dataclass(slots=True)

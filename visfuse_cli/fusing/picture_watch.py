@@ -5,14 +5,16 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
+from visfuse_cli.fusing.body import Body, usual_body
 from visfuse_cli.fusing.clocks import places_alone
-from visfuse_cli.fusing.person import Body, Person, usual_body
+from visfuse_cli.fusing.person import Person
 from visfuse_cli.fusing.settings import FuseConfig
 from visfuse_cli.fusing.sighting import expect, learn_body, tracked_point
 from visfuse_cli.fusing.tracker import PRIOR_LOOKS, Newcomer, Tracker, beginning
 from visfuse_cli.records import Array, Gaussian, Image, Sighting
 from visfuse_cli.vision import silhouettes
 from visfuse_cli.vision.background import Background
+from visfuse_cli.vision.ground_shadows import GroundShadows
 from visfuse_cli.vision.matching import agree
 from visfuse_cli.vision.occupancy import Occupancy
 from visfuse_cli.vision.silhouettes import Expected
@@ -35,12 +37,14 @@ class Camera:
         self._background = Background(settings.model, settings.threshold, settings.shadow_ratio, settings.memory_s)
         self._background.start(empty)
         self._picture: Image = empty
-        self.mask: Image = np.zeros(empty.shape[:2], np.uint8)
+        self.labels: Image = np.zeros(empty.shape[:2], np.uint8)
+        self.mask = self.labels
 
     def look(self, image: Image) -> None:
         """Find out what moves in a frame of the footage."""
         self._picture = self.straight.picture(image)
-        self.mask = silhouettes.moving(self._background.detect(self._picture))
+        self.labels = self._background.detect(self._picture)
+        self.mask = silhouettes.moving(self.labels)
 
     def learn(self, t: float, boxes: Array) -> None:
         """Adapt to the latest picture, except inside boxes [u0, v0, u1, v1] (n, 4) px."""
@@ -54,7 +58,16 @@ class PictureWatch:
         self._cameras, self._P, self._config = cameras, P, config
         sizes = np.array([camera.straight.size for camera in cameras])
         self._occupancy = Occupancy(P, sizes, config.person.height)
+        self._shadows = GroundShadows(P, sizes, self._occupancy.places) if len(self._occupancy.places) else None
         self._dt: dict[int, float] = {}
+
+    def settle(self, cameras: list[int]) -> None:
+        """Tell people from shadows in the latest pictures of `cameras`, by what they say of the same ground."""
+        if self._shadows is None:
+            return
+        settled = self._shadows.settle({camera: self._cameras[camera].labels for camera in cameras})
+        for camera, labels in settled.items():
+            self._cameras[camera].mask = silhouettes.moving(labels)
 
     def places(self, camera: int) -> Array:
         """Where on the ground (k, 2) m what moves in one camera's latest picture alone puts people."""
@@ -103,17 +116,14 @@ class PictureWatch:
         return expect(
             self._P,
             _stacked([person.belief for person in people]),
-            np.array([person.body.height.mean for person in people]),
-            np.array([person.body.width.mean for person in people]),
+            [person.body for person in people],
             np.array([0 if person.confirmed else 1 for person in people], dtype=np.intp),
             self._config,
         )
 
     def _sightings(self, expected: list[Expected], who: int, body: Body) -> dict[int, Sighting]:
         """What each camera sees of one of the expected people, whose lengths are learnt."""
-        found = {}
-        looks = max(body.height.looks / PRIOR_LOOKS, 1.0)
-        sigma = float(np.hypot(self._config.person.height_sigma / np.sqrt(looks), 0.03))
+        found, assumed = {}, body.ends.mean
         for camera, dt in self._dt.items():
             there = expected[camera]
             if not (np.isfinite(there.box[who]).all() and there.depth[who] > 0):
@@ -121,18 +131,19 @@ class PictureWatch:
             seen = silhouettes.sides(self._cameras[camera].mask, there, who)
             if seen is None or seen.share < LEAST_SHARE:
                 continue
-            measured = tracked_point(there, who, seen, body, sigma, self._config)
+            measured = tracked_point(there, who, seen, body, self._config)
             if measured is not None:
+                z, R, lever = measured
                 shown = self._cameras[camera].straight.shown(seen.box[None])[0]
-                found[camera] = Sighting(*measured, shown, dt, min(seen.share, 1.0))
-                learn_body(body, there, who, seen)
+                found[camera] = Sighting(z, R, shown, dt, lever, float(lever @ assumed))
+                learn_body(body, assumed, there, who, seen)
         return found
 
     def _newcomer(self, place: Array, people: list[Person]) -> Newcomer | None:
         """Whoever stands near a place (2,) m, if two cameras or more agree on it and on somebody of human size."""
         person = self._config.person
-        body = usual_body(person.height, person.width, 2.0)
-        level = 0.0 if self._config.fusion.point == "foot" else body.height.mean / 2
+        body = usual_body(person.height, person.height_sigma, person.width, 2.0)
+        level = 0.0 if self._config.fusion.point == "foot" else body.ends.height / 2
         at = Gaussian(np.array([*place, level]), START_SIGMA**2 * np.eye(3))
         sightings: dict[int, Sighting] = {}
         for _ in range(ROUNDS):
@@ -141,8 +152,7 @@ class PictureWatch:
             expected = expect(
                 self._P,
                 _stacked(everybody),
-                np.array([*(other.body.height.mean for other in people), body.height.mean]),
-                np.array([*(other.body.width.mean for other in people), body.width.mean]),
+                [*(other.body for other in people), body],
                 np.array([0] * len(people) + [1], dtype=np.intp),
                 self._config,
             )
@@ -157,14 +167,16 @@ class PictureWatch:
             point, used = agreed
             at = Gaussian(point.mean, point.cov)
             sightings = {camera: sightings[camera] for camera, good in zip(cameras, used, strict=True) if good}
-        level = at.mean[2] - (0.0 if self._config.fusion.point == "foot" else body.height.mean / 2)
-        if abs(level) > FLOATING_M or not person.shortest < body.height.mean < person.tallest:
+        level = at.mean[2] - (0.0 if self._config.fusion.point == "foot" else body.ends.height / 2)
+        if abs(level) > FLOATING_M or not person.shortest < body.ends.height < person.tallest:
             return None
-        return Newcomer(at, sightings, body.height.mean)
+        return Newcomer(at, sightings, body.ends.height)
 
     def _boxes_of(self, new: Newcomer) -> dict[int, Array]:
-        usual = np.array([new.height]), np.array([self._config.person.width]), np.zeros(1, dtype=np.intp)
-        expected = expect(self._P, _stacked([beginning(new.place, self._config)]), *usual, self._config)
+        person = self._config.person
+        body = usual_body(new.height, person.height_sigma, person.width, PRIOR_LOOKS)
+        belief = _stacked([beginning(new.place, self._config)])
+        expected = expect(self._P, belief, [body], np.zeros(1, dtype=np.intp), self._config)
         return {camera: self._widened(expected[camera].box)[0] for camera in self._dt}
 
     @staticmethod

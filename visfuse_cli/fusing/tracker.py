@@ -8,8 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from visfuse_cli.fusing.audit import Audit
+from visfuse_cli.fusing.body import usual_body
 from visfuse_cli.fusing.estimate import Sights, at_one_time, consistent, fuse
-from visfuse_cli.fusing.person import History, Person, usual_body
+from visfuse_cli.fusing.person import History, Person
 from visfuse_cli.fusing.settings import FuseConfig
 from visfuse_cli.maths import fusion_rivals, gaussian
 from visfuse_cli.maths.assignment import gate_size
@@ -143,7 +144,7 @@ class Tracker:
                 id=self._next_id,
                 belief=belief,
                 start=belief,
-                body=usual_body(new.height, settings.width, PRIOR_LOOKS),
+                body=usual_body(new.height, settings.height_sigma, settings.width, PRIOR_LOOKS),
                 history=History(len(self.P)),
                 t=t,
                 last_seen=t,

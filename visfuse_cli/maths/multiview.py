@@ -55,6 +55,13 @@ def project(P: Array, points: Array) -> tuple[Array, Array]:
     return pixels, (P[..., :2, :3] - pixels[..., None] * P[..., 2:, :3]) / depth[..., None]
 
 
+def slopes(P: Array, points: Array) -> Array:
+    """How steeply cameras P (C, 3, 4) look down at points (T, 3): tangents (T, C) of the angle under the horizon."""
+    centres = -np.linalg.solve(P[:, :, :3], P[:, :, 3:])[..., 0]
+    apart = centres - points[:, None]
+    return np.asarray(apart[..., 2] / np.maximum(np.linalg.norm(apart[..., :2], axis=-1), 1e-3))
+
+
 def depths(P: Array, points: Array) -> Array:
     """Depths (...) m along the optical axes of points (..., 3) under cameras (..., 3, 4) with unit third rows."""
     return np.asarray(np.sum(P[..., 2, :3] * points, axis=-1) + P[..., 2, 3])

@@ -15,6 +15,7 @@ SMALLEST_PX = 24  # of a person's height, to be found
 TRUNK_M = 0.36  # width of the box that a person should fill
 FILLED, EXPECTED = 0.42, 0.35  # share of that box that moves where somebody stands, and what speaks for nobody
 MOST = 60_000  # places; a larger area is searched in larger steps
+AT_ONCE = 4096  # places whose boxes are computed at once: memory that is free again before anything is followed
 
 
 class Occupancy:
@@ -66,5 +67,11 @@ class Occupancy:
 def _trunks(P: Array, places: Array, height: float) -> Array:
     """Boxes (n, C, 4) px of narrow upright people at places (n, 2) m."""
     foot = np.column_stack([places, np.zeros(len(places))])
-    each = np.full(len(places), height)
-    return people.boxes(P, people.outline(foot, each, np.full(len(places), TRUNK_M))[:, None])
+    found = np.empty((len(places), len(P), 4))
+    for begin in range(0, len(places), AT_ONCE):
+        part = slice(begin, begin + AT_ONCE)
+        each = np.full(len(foot[part]), height)
+        outline = people.outline(foot[part], each, np.full(len(each), TRUNK_M))
+        for camera, projection in enumerate(P):
+            found[part, camera] = people.boxes(projection, outline)
+    return found

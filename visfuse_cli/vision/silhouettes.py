@@ -25,8 +25,9 @@ class Expected:
     """People in one camera's picture, T of them: where each is expected.
 
     box [u0, v0, u1, v1] (T, 4) px, axis (T, 2, 2) px from foot to head, point (T, 2) px that is tracked,
-    half_width (T,) px, depth (T,) m, scale (T,) px per m, reach (T,) px that each may be off, and rank (T,):
-    a lower one owns pixels before a higher one.
+    half_width (T,) px, depth (T,) m, scale (T,) px per m upwards, slope (T,) m upwards that look like one towards the
+    camera, level (T,) m of the feet above the ground, reach (T,) px that each may be off, and rank (T,): a lower one
+    owns pixels before a higher one.
     """
 
     box: Array
@@ -35,6 +36,8 @@ class Expected:
     half_width: Array
     depth: Array
     scale: Array
+    slope: Array
+    level: Array
     reach: Array
     rank: NDArray[np.intp]
 
