@@ -28,7 +28,7 @@ def with_car(picture, left, colour=(40, 40, 200), top=50, size=(40, 30), window=
     return picture
 
 
-@pytest.fixture(params=["mog2", "knn"])
+@pytest.fixture(params=["mog2", "knn", "kalman"])
 def background(request):
     model = Background(request.param, 16.0, 0.45, 60.0)
     model.start(road())
@@ -71,9 +71,10 @@ def test_looking_changes_nothing(background):
 
 
 @pytest.mark.parametrize("followed", [True, False])
-def test_what_is_followed_never_dissolves(followed):
+@pytest.mark.parametrize("model", ["mog2", "kalman"])
+def test_what_is_followed_never_dissolves_and_what_stands_joins(model, followed):
     rng = np.random.default_rng(5)
-    background = Background("mog2", 16.0, 0.45, 60.0)
+    background = Background(model, 16.0, 0.45, 60.0)
     background.start(road())
     outline = np.array([[16.0, 46], [64, 46], [64, 84], [16, 84]])
     for k in range(600):
@@ -104,3 +105,18 @@ def test_ghosts_need_contrast_in_the_background_alone():
     assert not find_ghosts(car, car, moved, grey).any()
     assert not find_ghosts(grey, car, moved, car).any()  # it has only just gone
     assert not find_ghosts(grey, grey, np.zeros_like(grey), grey).any()
+
+
+def test_the_kalman_background_learns_the_noise_and_the_slow_change_of_light():
+    rng = np.random.default_rng(6)
+    background = Background("kalman", 16.0, 0.45, 20.0)
+    background.start(road())
+    brighter, share = road(), []
+    for k in range(0, 1500, 2):
+        brighter = np.clip(road() * (1 + k / 15000), 0, 255)  # a tenth more light within a minute
+        labels = background.detect(noisy(brighter, rng, 3.0))
+        share.append((labels > 0).mean())
+        background.learn(noisy(brighter, rng, 3.0), k / 25, [])
+    assert max(share[100:]) < 0.01
+    picture = with_car(brighter.astype(np.uint8), 20)
+    assert (background.detect(noisy(picture, rng, 3.0))[52:78, 22:58] == FOREGROUND).mean() > 0.9

@@ -35,6 +35,7 @@ from visfuse_cli.tracking.camera_watch import CameraWatch
 from visfuse_cli.tracking.conclude import conclude
 from visfuse_cli.tracking.foreground import Detections, Detector, MovingRegions
 from visfuse_cli.tracking.ground import GroundTracker
+from visfuse_cli.tracking.headlights import REASON, Headlights
 from visfuse_cli.tracking.lanes import Way, find_lanes, lane_of, thinned
 from visfuse_cli.tracking.options import SpeedOptions
 from visfuse_cli.tracking.output import COLUMNS, abandoned_row, row_of, track_record
@@ -232,7 +233,7 @@ def _track(clip: _Clip, run_: Run, spool: TrackSpool, results: _Results, first_i
     with run_.stage("warm up"):
         empty = empty_picture(at_rest(_sampled(clip.source, clip.config.background.warmup_s)))
         watch = results.watches[clip.name] = CameraWatch(empty)
-        look = _detector(clip, empty)
+        look, lamps = _detector(clip, empty), Headlights(empty, clip.camera)
     for shown in run_.frames(clip.source):
         run_.count("frames")
         with run_.stage("steady"):
@@ -246,11 +247,12 @@ def _track(clip: _Clip, run_: Run, spool: TrackSpool, results: _Results, first_i
             ended = tracker.update(frame.index, evidence)
             if clip.config.privacy.blur:
                 strangers.add(frame.index, tracker.unexplained)
+            lamps.look(frame, tracker.tracks, tracker.headings())
         with run_.stage("conclude"):
-            _settle(*ended, clip, tracker, run_, spool, results, label)
+            _settle(*ended, clip, tracker, lamps, run_, spool, results, label)
         with run_.stage("learn"):
             look.learn(frame, tracker.outlines())
-    _settle(*tracker.finish(), clip, tracker, run_, spool, results, label)
+    _settle(*tracker.finish(), clip, tracker, lamps, run_, spool, results, label)
     audit = results.audits[clip.name] = clip.source.audit()
     for warning in (*audit.warnings, *watch.warnings(clip.name)):
         run_.warn(warning)
@@ -285,6 +287,7 @@ def _settle(
     abandoned: list[Abandoned],
     clip: _Clip,
     tracker: GroundTracker,
+    lamps: Headlights,
     run_: Run,
     spool: TrackSpool,
     results: _Results,
@@ -302,6 +305,8 @@ def _settle(
         position = path.planar.mean[:, :2]
         zone = trusted(clip.camera, position, config.pose.bias_px, config.speed.max_calibration)
         verdict = judge(path, clip.camera.ground.cov, config.pose.bias_px, config.speed, zone)
+        if lamps.only_light(path.id):
+            verdict = replace(verdict, reason=REASON)
         spool.add(track_record(path, verdict, clip.camera, label, watch.image_from_rest, config.latency))
         results.drawn[clip.name].append((int(path.frame[0]), path.id))
         results.ways[path.id] = thinned(position[verdict.first : verdict.last + 1])

@@ -22,7 +22,9 @@ from visfuse_cli.vision.steady import moved
 class BackgroundSettings(Section):
     """The adaptive background."""
 
-    model: Literal["mog2", "knn"] = Field("mog2", description="mog2: mixture of Gaussians; knn: nearest neighbours")
+    model: Literal["mog2", "knn", "kalman"] = Field(
+        "mog2", description="mog2: mixture of Gaussians; knn: nearest neighbours; kalman: adaptive Kalman filters"
+    )
     threshold: float = Field(16.0, gt=0, le=1000, description="squared distance (variances) of a foreground pixel")
     memory_s: float = Field(60.0, gt=0, le=36000, description="s: how long the background remembers")
     shadow_ratio: float = Field(0.45, gt=0, lt=1, description="darkest a shadow may be, as a share of the lit ground")

@@ -94,6 +94,10 @@ class GroundTracker:
         """Outlines (k, 2) px of the followed targets, as last known."""
         return [wireframe.silhouette(self.camera, *box) for box in zip(*self._boxes(), strict=True)]
 
+    def headings(self) -> list[float]:
+        """Headings (rad) of the followed targets, as last known."""
+        return [float(self.dynamics.heading(track.steps[-1].posterior.mean)) for track in self.tracks]
+
     def _boxes(self) -> tuple[Array, Array]:
         """Pose (N, 3) and size (N, 3) of the tracks, as last known."""
         pose = [self._pose_of(track.steps[-1].posterior.mean) for track in self.tracks]

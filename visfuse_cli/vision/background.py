@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from visfuse_cli.records import Array, Image
 from visfuse_cli.vision.ghosts import find_ghosts
+from visfuse_cli.vision.kalman_background import KalmanBackground
 
 FOREGROUND, SHADOW = 255, 127
 BLOCK = 4  # px: side of the places in which the empty scene is sought
@@ -25,7 +26,7 @@ LEARN_EVERY = 4  # frames: learning costs as much as looking
 
 
 class Background:
-    """OpenCV's MOG2 or KNN model with looking and learning apart (Lou 2002, sec. 2, motion detection).
+    """The adaptive Kalman model, OpenCV's MOG2 or KNN, with looking and learning apart (Lou 2002, sec. 2).
 
     Every few frames one is learnt, with the pixels of live tracks replaced by the background itself, so that a car
     that waits at a light does not dissolve into the road.
@@ -36,9 +37,11 @@ class Background:
         self._first: tuple[float, ...]  # rates at which the first picture is learnt
         if kind == "mog2":
             model, self._first = cv2.createBackgroundSubtractorMOG2(500, threshold, True), (1.0,)
+        elif kind == "kalman":
+            model, self._first = KalmanBackground(threshold), (1.0,)
         else:
             model, self._first = cv2.createBackgroundSubtractorKNN(500, threshold * 25, True), KNN_FIRST
-        self._looking = 0.0 if kind == "mog2" else KNN_LOOKING
+        self._looking = KNN_LOOKING if kind == "knn" else 0.0
         model.setShadowValue(SHADOW)
         model.setShadowThreshold(shadow_ratio)
         self._model = model

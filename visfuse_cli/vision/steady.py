@@ -20,6 +20,7 @@ AGREE_PX = 1.0  # a corner that is further off does not belong to what stands st
 LEAST_AGREEING, LEAST_SHARE = 8, 0.15  # of the corners must agree; vehicles hide many, foliage moves
 STILL_PX = 0.12  # less is left as it is: laying a picture back softens it
 FAR_PX = 5.0  # a larger turn of the camera is no similarity in the picture any more
+DARK = 16  # grey levels: a scene of which half is darker shows lamps and no corners
 COARSE_PX = 320  # width at which a knocked camera is found again
 
 
@@ -30,6 +31,7 @@ class Steady:
         self._reference = reference
         self._grey = cv2.cvtColor(reference, cv2.COLOR_BGR2GRAY)
         self._points = _corners(self._grey)
+        self._dark = bool(np.median(self._grey) < DARK)
         self._sharpness = _sharpness(self._grey, self._points)
         self._weight = np.linalg.det(self._sharpness) ** 0.25
         self._weight /= max(float(self._weight.sum()), 1e-9)
@@ -39,9 +41,9 @@ class Steady:
     def register(self, image: Image) -> Array | None:
         """`image_from_rest` (3, 3) px of a picture, None where what stands still cannot be found in it.
 
-        Without enough corners in the scene a camera counts as steady.
+        Without enough corners in the scene, or in the dark, a camera counts as steady.
         """
-        if len(self._points) < LEAST_POINTS:
+        if len(self._points) < LEAST_POINTS or self._dark:
             return np.eye(3)
         grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
         motion = self._followed(grey, self._last)
