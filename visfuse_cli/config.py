@@ -66,7 +66,7 @@ _Loader.add_implicit_resolver(
 
 def parse_yaml(text: str, where: str, error: type[Exception] = UsageError) -> tuple[Any, dict[Key, int]]:
     """Parse one YAML document into plain data and the line of every key; raises `error` with line and column."""
-    if len(text.encode()) > MAX_BYTES:
+    if len(text.encode("utf-8", "surrogatepass")) > MAX_BYTES:
         raise error(f"{where}: larger than {MAX_BYTES} bytes; not a configuration")
     loader = _Loader(text)
     try:
@@ -108,7 +108,11 @@ def _lines(node: Any, path: Key = ()) -> Iterable[tuple[Key, int]]:
 def read_text(path: Path, what: str, error: type[Exception] = UsageError) -> str:
     """Read a small UTF-8 text file; raises `error` naming the file when it cannot be read."""
     try:
-        return path.read_text(encoding="utf-8-sig")
+        with open(path, "rb") as file:
+            data = file.read(MAX_BYTES + 1)
+        if len(data) > MAX_BYTES:
+            raise error(f"{path}: larger than {MAX_BYTES} bytes; not {what}")
+        return data.decode("utf-8-sig")
     except UnicodeDecodeError as problem:
         raise error(f"{path}: {what} is not UTF-8 text") from problem
     except OSError as problem:
@@ -171,6 +175,8 @@ def _parse_override(override: str) -> tuple[Key, Any]:
     parts = tuple(part.strip() for part in key.split("."))
     if not separator or not all(parts):
         raise UsageError(f"--set {override}: write it as a.b.c=VALUE")
+    if text.startswith("%"):  # a time pattern; to YAML it would be a directive
+        return parts, text
     value, _ = parse_yaml(text, f"--set {override}")
     return parts, value
 

@@ -132,17 +132,18 @@ def _append(folder: Path, log: TrafficLog, settings: str) -> None:
         rows = list(csv.DictReader(file))
     for entry in document["inputs"]:
         name = Path(entry["path"]).name
+        shown = name.encode("utf-8", "backslashreplace").decode()  # as the tables have it
         if name in document["began_utc"]:
             clip = LoggedClip(
                 sha256=entry["sha256"],
                 settings=settings,
-                name=name,
+                name=shown,
                 began_utc=document["began_utc"][name],
                 duration_s=document["time_audit"][name]["duration_s"],
                 frames=document["time_audit"][name]["frames"],
                 version=document["version"],
             )
-            log.add(clip, [row for row in rows if row["clip"] == name])
+            log.add(clip, [row for row in rows if row["clip"] == shown])
 
 
 def text(result: RunResult) -> str:

@@ -92,6 +92,6 @@ def _size(text: str | None) -> tuple[int, int] | None:
     if text is None:
         return None
     width, separator, height = text.lower().partition("x")
-    if not (separator and width.isdigit() and height.isdigit() and int(width) and int(height)):
+    if not (separator and width.isdecimal() and height.isdecimal() and int(width) and int(height)):
         raise UsageError(f"--size {text}: write it as WIDTHxHEIGHT, like 1280x720")
     return int(width), int(height)

@@ -17,7 +17,7 @@ from pydantic import Field
 from visfuse_cli.config import Section
 from visfuse_cli.errors import InputError, OutputError, UsageError
 from visfuse_cli.files import homography as homography_files
-from visfuse_cli.files.atomic import replacing
+from visfuse_cli.files.atomic import failing_as_output, replacing
 from visfuse_cli.files.calibration_input import read_gaze, read_lines, read_points
 from visfuse_cli.files.lens_files import read_lens
 from visfuse_cli.files.stills import Stills
@@ -134,10 +134,10 @@ def write(request: RunRequest, survey: Survey, ground: GroundMap, image: Image |
         drawn = draw(image, ground, survey.marks, survey.world, survey.fit.used, config.noise.sigma_px)
         picture = request.out.with_suffix(".png")
         encoded = cv2.imencode(".png", drawn)[1].tobytes()
-    homography_files.write(request.out, ground)
     if picture is not None:
         with replacing(picture) as file:
             file.write(encoded)
+    homography_files.write(request.out, ground)
     warnings = (*survey.warnings, *doubts(survey, ground.image_size, config))
     return RunResult(request.out, _summary(request, ground, survey, picture, warnings), warnings)
 
@@ -145,10 +145,12 @@ def write(request: RunRequest, survey: Survey, ground: GroundMap, image: Image |
 def check_output(request: RunRequest, beside: tuple[Path, ...]) -> None:
     """Raise OutputError where H.json, or a file beside it, cannot be written or would replace something."""
     out = request.out
-    if out.is_dir():
-        raise OutputError(f"{out}: is a folder; give --out the name of a file, like H.json")
-    if not out.parent.is_dir():
-        raise OutputError(f"{out.parent}: no such folder")
+    with failing_as_output(out):
+        if out.is_dir():
+            raise OutputError(f"{out}: is a folder; give --out the name of a file, like H.json")
+        if not out.parent.is_dir():
+            raise OutputError(f"{out.parent}: no such folder")
+        out.exists()
     if out in beside:
         raise OutputError(f"{out}: a file beside it would take its name; give --out a name that ends in .json")
     inputs = [path for path in request.options.values() if isinstance(path, Path)]

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from visfuse_cli.errors import InputError, UsageError
+from visfuse_cli.files.folders import paths_of
 from visfuse_cli.files.images import write_image
 from visfuse_cli.files.multi_calibration import read_views
 from visfuse_cli.files.multi_scene import Footage, find_footage
@@ -84,7 +85,7 @@ def run(request: RunRequest) -> RunResult:
     offsets = _offsets(config, scene)
     results = _Results()
     with (
-        RunFolder(request.out, request.overwrite) as folder,
+        RunFolder(request.out, request.overwrite, inputs=[request.input, *paths_of(inputs)]) as folder,
         Run(request.progress) as run_,
         TrackSpool(folder, "fuse-cameras", request.seed, "world") as spool,
     ):

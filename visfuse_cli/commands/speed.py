@@ -19,6 +19,7 @@ from visfuse_cli.errors import InputError, UsageError
 from visfuse_cli.files import detections as detection_files
 from visfuse_cli.files import homography as homography_files
 from visfuse_cli.files.atomic import replacing
+from visfuse_cli.files.folders import paths_of
 from visfuse_cli.files.lanes_file import read_lanes, write_lanes
 from visfuse_cli.files.run_json import write_run_json
 from visfuse_cli.files.runfolder import RunFolder
@@ -50,6 +51,7 @@ from visfuse_cli.vision.steady import at_rest
 __all__ = ["SpeedConfig", "run", "text"]
 
 WARMUP_PICTURES = 31
+LEAST_SIDE = 8  # px
 SEEN_FRAMES = 8  # a region seen for fewer frames than this is noise and not worth a line in the ledger
 
 
@@ -134,7 +136,7 @@ def run(request: RunRequest) -> RunResult:
             results.began[path.name] = moment
             results.doubts += [doubt] if doubt else []
     with (
-        RunFolder(request.out, request.overwrite) as folder,
+        RunFolder(request.out, request.overwrite, inputs=[request.input, *paths_of(inputs)]) as folder,
         Run(request.progress) as run_,
         TrackSpool(folder, "speed", request.seed, "ground") as spool,
     ):
@@ -218,6 +220,10 @@ def _open(path: Path, request: RunRequest) -> VideoSource:
 
 def _check_size(source: VideoSource, ground: GroundMap, path: Path) -> None:
     size = (source.width, source.height)
+    if min(size) < LEAST_SIDE:
+        raise InputError(
+            f"{path}: is {size[0]}x{size[1]}; pictures of {LEAST_SIDE}x{LEAST_SIDE} and more are measured in"
+        )
     if ground.image_size is not None and size != ground.image_size:
         wide, high = ground.image_size
         raise InputError(

@@ -21,6 +21,7 @@ from visfuse_cli.facing.find import Finder, Found
 from visfuse_cli.facing.output import track_record
 from visfuse_cli.facing.settings import StereoConfig
 from visfuse_cli.facing.target import Target
+from visfuse_cli.files.folders import paths_of
 from visfuse_cli.files.run_json import write_run_json
 from visfuse_cli.files.runfolder import RunFolder
 from visfuse_cli.files.scene import check_scene, file, find_file, view
@@ -90,7 +91,7 @@ def run(request: RunRequest) -> RunResult:
     inputs = [describe(path) for path in (*scene.files, *scene.views.values())]
     results = _Results()
     with (
-        RunFolder(request.out, request.overwrite) as folder,
+        RunFolder(request.out, request.overwrite, inputs=[request.input, *paths_of(inputs)]) as folder,
         Run(request.progress) as run_,
         TrackSpool(folder, "track-stereo-pf", request.seed, "left-camera") as spool,
     ):

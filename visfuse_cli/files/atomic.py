@@ -52,12 +52,15 @@ def replacing_path(path: str | Path) -> Iterator[Path]:
 
 @contextmanager
 def replacing(path: str | Path, mode: str = "wb") -> Iterator[IO[Any]]:
-    """Open `path` for writing ("wb" or "w", UTF-8) so that it appears whole or not at all; raises OutputError."""
-    encoding, newline = (None, None) if "b" in mode else ("utf-8", "")
+    """Open `path` for writing ("wb" or "w", UTF-8) so that it appears whole or not at all; raises OutputError.
+
+    Bytes of a file's name that are no UTF-8 are written as escapes.
+    """
+    encoding, newline, errors = (None, None, None) if "b" in mode else ("utf-8", "", "backslashreplace")
     with (
         replacing_path(path) as partial,
         failing_as_output(Path(path)),
-        open(partial, mode, encoding=encoding, newline=newline) as file,
+        open(partial, mode, encoding=encoding, newline=newline, errors=errors) as file,
     ):
         yield file
 

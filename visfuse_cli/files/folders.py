@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import re
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -58,6 +59,11 @@ def natural(name: str) -> tuple[list[tuple[int, str]], str]:
     return [(int(part), "") if part[:1].isdecimal() else (-1, part) for part in parts], name
 
 
+def paths_of(described: Iterable[dict[str, Any]]) -> list[str]:
+    """The paths of what `describe` has described."""
+    return [entry["path"] for entry in described]
+
+
 def describe(path: str | Path) -> dict[str, Any]:
     """An input's path, size (bytes) and SHA-256 for run.json; a folder's is over its files' names and contents."""
     path = Path(path)
@@ -65,6 +71,8 @@ def describe(path: str | Path) -> dict[str, Any]:
     try:
         names = sorted(p for p in path.iterdir() if p.is_file() and p.name[0] != ".") if path.is_dir() else [path]
         for name in names:
+            if name.exists() and not name.is_file():  # a device or a pipe has no end, or can be read once only
+                raise InputError(f"{name}: is not a file")
             with open(name, "rb") as file:
                 own = hashlib.file_digest(file, "sha256")
                 size += file.tell()

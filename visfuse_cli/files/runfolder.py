@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import fcntl
 import os
+from collections.abc import Iterable
 from pathlib import Path
 from types import TracebackType
 
@@ -24,21 +25,24 @@ class RunFolder:
 
     Enter it once every input is validated: with `overwrite` the earlier run's results go on entering, and nothing
     else does. A folder that holds only what a killed run left behind counts as empty. Raises OutputError where the
-    folder is not empty or cannot be made, BusyError where another run holds it. A `shared` folder is one above
-    several runs: it is locked, and nothing in it is touched.
+    folder is not empty or cannot be made, or where one of `inputs` is it or would be lost in it, BusyError where
+    another run holds it. A `shared` folder is one above several runs: it is locked, and nothing in it is touched.
     """
 
-    def __init__(self, out: str | Path, overwrite: bool = False, *, shared: bool = False) -> None:
+    def __init__(
+        self, out: str | Path, overwrite: bool = False, *, inputs: Iterable[str | Path] = (), shared: bool = False
+    ) -> None:
         self.path = Path(out)
+        self.inputs = {Path(path).resolve() for path in inputs}
         self.overwrite = overwrite
         self.shared = shared
         self._lock = -1
         self._created = False
 
     def __enter__(self) -> Path:
-        if self.path.exists() and not self.path.is_dir():
-            raise OutputError(f"{self.path}: is a file; give --out a folder")
         with failing_as_output(self.path):
+            if self.path.exists() and not self.path.is_dir():
+                raise OutputError(f"{self.path}: is a file; give --out a folder")
             self._created = not self.path.exists()
             self.path.mkdir(parents=True, exist_ok=True)
             self._acquire()
@@ -83,5 +87,8 @@ class RunFolder:
         if present and not self.overwrite:
             raise OutputError(f"{self.path}: is not empty; give --overwrite or another folder")
         results = {name for pattern in RESULTS for name in self.path.glob(pattern)}
+        lost = sorted({name.resolve() for name in (self.path, *results)} & self.inputs)
+        if lost:
+            raise OutputError(f"{lost[0]}: is an input, and results would take its place; give --out another folder")
         for name in leftovers | results:
             name.unlink()

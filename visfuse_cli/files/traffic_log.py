@@ -80,7 +80,7 @@ class TrafficLog:
 
     def digest(self, path: Path) -> str:
         """The SHA-256 of a recording; one that has not changed since it was last asked for is not read again."""
-        known = (os.path.abspath(path), *_state(path))
+        known = (os.fsencode(os.path.abspath(path)), *_state(path))
         kept = "path = ? AND size = ? AND mtime_ns = ? AND ctime_ns = ? AND inode = ?"
         with self._problems():
             found = self._base.execute(f"SELECT sha256 FROM files WHERE {kept}", known).fetchone()
@@ -193,5 +193,6 @@ def _migrate(base: sqlite3.Connection, path: Path) -> None:
         base.execute(f"PRAGMA user_version = {VERSION}")
         base.execute("COMMIT")
     except BaseException:
-        base.execute("ROLLBACK")
+        with suppress(sqlite3.Error):
+            base.execute("ROLLBACK")
         raise

@@ -170,6 +170,8 @@ def _corners(grey: Image) -> NDArray[np.float32]:
     for top, bottom in itertools.pairwise(down):
         for left, right in itertools.pairwise(across):
             cell = quality[top:bottom, left:right]
+            if not cell.size:  # a picture of a few pixels
+                continue
             v, u = np.unravel_index(np.argmax(cell), cell.shape)
             if cell[v, u] > 0:
                 found.append((left + u, top + v))

@@ -11,6 +11,7 @@ from visfuse_cli.commands.track_imm.pan_tilt import PanTiltRun
 from visfuse_cli.commands.track_imm.scene import open_views
 from visfuse_cli.commands.track_imm.stereo import StereoRun
 from visfuse_cli.errors import InputError
+from visfuse_cli.files.folders import paths_of
 from visfuse_cli.files.run_json import write_run_json
 from visfuse_cli.files.runfolder import RunFolder
 from visfuse_cli.files.scene import check_scene, file
@@ -32,7 +33,7 @@ def run(request: RunRequest) -> RunResult:
     head = _head(request)
     inputs = [describe(path) for path in (*head.files, *head.views.values())]
     with (
-        RunFolder(request.out, request.overwrite) as folder,
+        RunFolder(request.out, request.overwrite, inputs=[request.input, *paths_of(inputs)]) as folder,
         Run(request.progress) as run_,
         TrackSpool(folder, "track-imm", request.seed, head.frame_of_reference) as spool,
     ):
