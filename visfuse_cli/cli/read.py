@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 from typing import Annotated
 
@@ -56,13 +57,15 @@ def evaluate(
     Example: visfuse evaluate run --truth truth.csv --gate 0.5
     """
     from visfuse_cli.evaluate.run import evaluate as judge
-    from visfuse_cli.evaluate.run import text
+    from visfuse_cli.evaluate.text import text
 
     if truth is not None and reference is not None:
         raise UsageError("--truth and --reference: give one of them")
-    if not gate > 0:
+    if not 0 < gate < math.inf:
         raise UsageError(f"--gate {gate:g}: must be above zero, metres")
-    found = judge(run, truth, reference, gate, plane)
+    found, warnings = judge(run, truth, reference, gate, plane)
+    for warning in warnings:
+        typer.echo(f"visfuse: warning: {warning}", err=True)
     if as_json:
         typer.echo(json.dumps(found, allow_nan=False))
     elif not (quiet or voice.quiet):
