@@ -8,7 +8,7 @@ from __future__ import annotations
 import difflib
 import json
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from importlib import resources
 from pathlib import Path
 from typing import Any, TypeVar
@@ -236,8 +236,38 @@ def nearest(name: str, known: Iterable[str]) -> str:
 
 
 def dump(config: Section) -> str:
-    """The resolved configuration as YAML, in the order the model declares."""
-    return yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False, allow_unicode=True)
+    """The resolved configuration as YAML, in the order the model declares, each key with its description."""
+    return "\n".join(_explained(config, "")) + "\n"
+
+
+def _explained(section: BaseModel, indent: str) -> Iterator[str]:
+    for name, field in type(section).model_fields.items():
+        value = getattr(section, name)
+        if isinstance(value, BaseModel):
+            yield f"{indent}{name}:"
+            yield from _explained(value, indent + "  ")
+            continue
+        plain = section.model_dump(mode="json", include={name})
+        inner = None if isinstance(plain[name], list | dict) else False  # lists of numbers stay on one line
+        text = yaml.safe_dump(plain, sort_keys=False, allow_unicode=True, default_flow_style=inner, width=100)
+        lines = [indent + line for line in text.splitlines()]
+        if field.description:
+            lines[0] += f"  # {field.description}"
+        yield from lines
+
+
+def changed(config: Section) -> list[str]:
+    """Dotted keys whose values differ from the defaults."""
+    return list(_changed(config, type(config)(), ""))
+
+
+def _changed(section: BaseModel, default: BaseModel, prefix: str) -> Iterator[str]:
+    for name in type(section).model_fields:
+        mine, usual = getattr(section, name), getattr(default, name)
+        if isinstance(mine, BaseModel) and type(mine) is type(usual):
+            yield from _changed(mine, usual, f"{prefix}{name}.")
+        elif mine != usual:
+            yield f"{prefix}{name}"
 
 
 def schema(model: type[Section]) -> str:

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 app = typer.Typer(
     name="visfuse",
     help="Recorded footage and sensor logs in, trustworthy 3D tracks and speeds out.",
+    epilog="visfuse COMMAND --help shows an example of each; visfuse demo is a first run.",
     no_args_is_help=True,
     rich_markup_mode=None,
     pretty_exceptions_enable=False,

@@ -13,7 +13,7 @@ from visfuse_cli.cli.app import app, voice
 from visfuse_cli.cli.options import JsonOption, NoProgressOption, QuietOption
 
 
-@app.command("batch")
+@app.command("batch", short_help="Any mix of commands over many recordings.")
 def batch(
     manifest: Annotated[Path, typer.Argument(metavar="MANIFEST.yaml", help="What to run on which recordings.")],
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for the results, one below it an item.")],

@@ -14,7 +14,7 @@ from visfuse_cli.cli.options import ConfigOption, JsonOption, QuietOption, SetOp
 from visfuse_cli.errors import UsageError
 
 
-@app.command("calibrate-homography")
+@app.command("calibrate-homography", short_help="Image or gaze angles to ground plane, from a survey.")
 def calibrate_homography(
     out: Annotated[Path, typer.Option("--out", metavar="H.json", help="The homography to write.")],
     points: Annotated[

@@ -14,7 +14,7 @@ from visfuse_cli.errors import UsageError
 if TYPE_CHECKING:
     from visfuse_cli.config import Section
 
-config_app = typer.Typer(help="Show, check or describe the configuration of a command.", no_args_is_help=True)
+config_app = typer.Typer(help="Show, check or describe a command's configuration.", no_args_is_help=True)
 app.add_typer(config_app, name="config", rich_help_panel=None)
 
 CONFIGURED = {  # command -> where its configuration model is
@@ -47,11 +47,14 @@ def load_config(command: str, name: str | None, overrides: list[str] | None) -> 
 
 @config_app.command("show")
 def show(
-    command: Annotated[str, typer.Argument(metavar="COMMAND")],
-    file: Annotated[str | None, typer.Argument(metavar="[FILE]")] = None,
+    command: Annotated[str, typer.Argument(metavar="COMMAND", help="Like speed.")],
+    file: Annotated[str | None, typer.Argument(metavar="[FILE]", help="A YAML file, or a shipped name.")] = None,
     set_: SetOption = None,
 ) -> None:
-    """Print the complete configuration a command would run with."""
+    """Print the complete configuration a command would run with, each key explained.
+
+    Example: visfuse config show speed > my.yaml
+    """
     from visfuse_cli.config import dump
 
     typer.echo(dump(load_config(command, file, set_)), nl=False)
@@ -59,19 +62,28 @@ def show(
 
 @config_app.command("check")
 def check(
-    command: Annotated[str, typer.Argument(metavar="COMMAND")],
-    file: Annotated[str, typer.Argument(metavar="FILE")],
+    command: Annotated[str, typer.Argument(metavar="COMMAND", help="Like speed.")],
+    file: Annotated[str, typer.Argument(metavar="FILE", help="A YAML file, or a shipped name.")],
     set_: SetOption = None,
 ) -> None:
-    """Check a configuration file without running anything."""
-    load_config(command, file, set_)
+    """Check a configuration file without running anything, and tell which keys differ from the defaults.
+
+    Example: visfuse config check speed my.yaml
+    """
+    from visfuse_cli.config import changed
+
+    config = load_config(command, file, set_)
     if not voice.quiet:
-        typer.echo(f"{file}: good for {command}")
+        keys = changed(config)
+        typer.echo(f"{file}: good for {command}; {', '.join(keys) if keys else 'all as by default'}")
 
 
 @config_app.command("schema")
-def schema(command: Annotated[str, typer.Argument(metavar="COMMAND")]) -> None:
-    """Print the JSON schema of a command's configuration."""
+def schema(command: Annotated[str, typer.Argument(metavar="COMMAND", help="Like speed.")]) -> None:
+    """Print the JSON schema of a command's configuration, with which editors check and complete it.
+
+    Example: visfuse config schema speed > speed.schema.json
+    """
     from visfuse_cli.config import schema as schema_of
 
     typer.echo(schema_of(model_of(command)))

@@ -9,15 +9,18 @@ import signal
 import sys
 import tempfile
 import traceback
+from importlib import import_module
 from types import FrameType
 from typing import NoReturn
 
 import typer
 
 from visfuse_cli import __version__
-from visfuse_cli.cli import batch, calibrate, configure, read, track  # noqa: F401  (each adds its commands to the app)
 from visfuse_cli.cli.app import app
 from visfuse_cli.errors import OutputError, VisfuseError
+
+for group in ("calibrate", "track", "read", "batch", "configure"):  # in the order of --help
+    import_module(f"visfuse_cli.cli.{group}")  # adds its commands to the app
 
 
 def _fail(message: str, code: int) -> NoReturn:

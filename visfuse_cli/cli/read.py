@@ -17,7 +17,7 @@ BY = ("hour", "day", "weekday", "lane", "direction")
 FORMS = ("table", "csv", "json", "parquet")
 
 
-@app.command("report")
+@app.command("report", short_help="One HTML page about one or several runs.")
 def report(
     runs: Annotated[list[Path], typer.Argument(metavar="RUN...", help="Folders that tracking commands wrote.")],
     out: Annotated[
@@ -36,7 +36,7 @@ def report(
         typer.echo(f"{'report':<12} {page}")
 
 
-@app.command("evaluate")
+@app.command("evaluate", short_help="Errors and consistency of a run, against a reference.")
 def evaluate(
     run: Annotated[Path, typer.Argument(metavar="RUN", help="Folder that a tracking command wrote.")],
     truth: Annotated[
@@ -72,7 +72,7 @@ def evaluate(
         typer.echo(text(found))
 
 
-@app.command("summary")
+@app.command("summary", short_help="What a traffic log says: percentiles, pace, counts.")
 def summary(
     log: Annotated[Path, typer.Argument(metavar="F.sqlite", help="A traffic log, written by speed --log.")],
     by: Annotated[
@@ -116,7 +116,7 @@ def summary(
         typer.echo(command.as_text(found, form))  # type: ignore[arg-type]
 
 
-@app.command("export")
+@app.command("export", short_help="Tracks of a run, or a log's vehicles, as other files.")
 def export(
     source: Annotated[Path, typer.Argument(metavar="RUN", help="Folder of a run, or a traffic log.")],
     form: Annotated[

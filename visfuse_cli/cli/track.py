@@ -57,7 +57,7 @@ def _with_page(result: RunResult) -> RunResult:
     return result
 
 
-@app.command("speed")
+@app.command("speed", short_help="Speed of every vehicle before one fixed camera.")
 @takes_tracking
 def speed(
     input_: Annotated[Path, typer.Argument(metavar="INPUT", help="A video, a folder of images, or a folder of clips.")],
@@ -94,7 +94,7 @@ def speed(
         _finish(command, request, shared)
 
 
-@app.command("fuse-cameras")
+@app.command("fuse-cameras", short_help="People before several calibrated cameras, in 3D.")
 @takes_tracking
 def fuse_cameras(
     scene: Annotated[
@@ -114,7 +114,7 @@ def fuse_cameras(
     _finish(command, _request("fuse-cameras", scene, shared, estimate_offsets=estimate_offsets), shared)
 
 
-@app.command("track-stereo-pf")
+@app.command("track-stereo-pf", short_help="Speed of vehicles that face a static stereo pair.")
 @takes_tracking
 def track_stereo_pf(
     scene: Annotated[
@@ -131,7 +131,7 @@ def track_stereo_pf(
     _finish(command, _request("track-stereo-pf", scene, shared), shared)
 
 
-@app.command("track-imm")
+@app.command("track-imm", short_help="What moves before a moving stereo camera, in 3D.")
 @takes_tracking
 def track_imm(
     scene: Annotated[
