@@ -34,6 +34,9 @@ class Tracking:
     overwrite: OverwriteOption = False
     no_video: Annotated[bool, typer.Option("--no-video", help="Write no annotated video.")] = False
     no_report: Annotated[bool, typer.Option("--no-report", help="Write no report.html.")] = False
+    rerun: Annotated[
+        Path | None, typer.Option("--rerun", metavar="FILE.rrd", help="Also write the run for the Rerun viewer.")
+    ] = None
     start: Annotated[
         float | None, typer.Option("--start", metavar="S", help="Begin at this second of the footage.")
     ] = None

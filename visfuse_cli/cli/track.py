@@ -45,8 +45,16 @@ def _request(command: str, input_: Path, shared: Tracking, **options: Any) -> Ru
 
 
 def _finish(command: Any, request: RunRequest, shared: Tracking) -> None:
-    """Run, write the report where it is wanted, and tell."""
-    result = command.run(request)
+    """Run, write the report and the recording where they are wanted, and tell."""
+    if shared.rerun is None:
+        result = command.run(request)
+    else:
+        from visfuse_cli.apps import rerun_log
+
+        rerun_log.check(request, shared.rerun)
+        result = command.run(request)
+        if result.stopped_by is None:
+            rerun_log.write(request, result, shared.rerun)
     tell(_with_page(result) if request.report else result, command.text, shared.as_json, shared.quiet)
 
 
@@ -84,6 +92,8 @@ def speed(
     from visfuse_cli.commands import speed as command
 
     request = _request("speed", input_, shared, homography=homography, detections=detections)
+    if log is not None and shared.rerun is not None:
+        raise UsageError("--rerun goes with a run of its own, without --log")
     if log is not None:
         from visfuse_cli.apps import traffic_log
 

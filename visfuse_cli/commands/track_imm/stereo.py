@@ -69,6 +69,7 @@ class StereoRun:
         self._straighten = _Pictures(self._rig, self._size)
         self._frames: list[int] = []
         self._ways: list[Array] = []  # (3,) m
+        self._turns: list[Array] = []  # (3, 3)
         self._covs: list[Array] = []  # (4, 4)
 
     def follow(self, sources: dict[str, VideoSource], run_: Run) -> Iterator[dict[str, Any] | None]:
@@ -99,7 +100,12 @@ class StereoRun:
         """What the summary and run.json hold besides."""
         way = np.stack(self._ways) if self._ways else np.zeros((0, 3))
         driven = float(np.sum(np.linalg.norm(np.diff(way, axis=0), axis=1)))
-        return {"ego_distance": driven}, {"ego": {"frame": self._frames, "position": way.round(6).tolist()}}
+        ego = {
+            "frame": self._frames,
+            "position": way.round(6).tolist(),
+            "rotation": [R.round(9).tolist() for R in self._turns],  # x_world = rotation x_camera + position
+        }
+        return {"ego_distance": driven}, {"ego": ego}
 
     def draw(self, sources: dict[str, VideoSource], records: list[dict[str, Any]], path: Path, run_: Run) -> None:
         """Write both views side by side with a map, from a second decode."""
@@ -124,6 +130,7 @@ class StereoRun:
         if keep is not None:
             self._frames.append(keep)
             self._ways.append(pose.T[0])
+            self._turns.append(pose.R[0])
             self._covs.append(pose.cov[0])
         return Head(t, pose.R[0], pose.T[0])
 
