@@ -84,7 +84,7 @@ def test_one_pair_is_that_pairs_kalman_filter():
     prior = Gaussian(np.array([[0.1, 0.2, 0.9, 0.5, 0.0, 0.0]]), np.eye(6)[None] * 0.3)
     y, R = np.array([[0.3, 0.1, 1.0]]), np.diag([0.01, 0.02, 0.03])[None]
     loop = fusion.closed_loop(prior, np.zeros(1, dtype=int), y, R)
-    kalman, _ = gaussian.update(prior, y - prior.mean[:, :3], fusion.C, R)
+    kalman, _ = gaussian.update(prior, y - prior.mean[:, :3], fusion.position(6), R)
     np.testing.assert_allclose(loop.mean, kalman.mean, atol=1e-12)
     np.testing.assert_allclose(loop.cov, kalman.cov, atol=1e-12)
 

@@ -12,7 +12,7 @@ from visfuse_cli.fusing.estimate import Sights, at_one_time, fuse, pair_up
 from visfuse_cli.fusing.noise import disagreement, restlessness
 from visfuse_cli.fusing.person import ASSUMED, BOX, DT, LEVER, VARIANCE, Person, Z
 from visfuse_cli.fusing.settings import FuseConfig
-from visfuse_cli.fusing.tracker import motion
+from visfuse_cli.fusing.tracker import at_rest, held_motion
 from visfuse_cli.maths import fusion, fusion_rivals, gaussian
 from visfuse_cli.maths.fusion_rivals import Bank
 from visfuse_cli.maths.gaussian import times
@@ -22,6 +22,7 @@ from visfuse_cli.records import Array, Gaussian
 
 DENIED = 1  # camera or more with a clear sight that speak against a prediction
 BODY_SIGMA = 0.0035  # m, times the root of the noise found: what cameras err alike, as by feet that point ahead
+UPRIGHT_SIGMA = 0.006  # m: heads are not as round as they are taken to be, nor is the ground as flat
 START_DOUBT = 2.0  # times the deviations a track began with
 
 
@@ -70,11 +71,12 @@ def conclude(person: Person, P: Array, config: FuseConfig) -> Path | None:
     if config.filter.adapt and config.smooth:
         noise, once = disagreement(sights, sights.z - pixels, t)
         places = _places(sights, pixels, J, belief, once)
-        sigma_a = restlessness(*places, t, sigma_a, config.filter.sigma_z, person.start)
+        sigma_a = restlessness(*places, t, config.filter, person.start)
         belief = _filtered(person, sights, P, t, state, config, noise, sigma_a)
         pixels, J = project(P[sights.camera], belief.mean[sights.owner, :3])
     cov = belief.cov.copy()
     cov[:, :3, :3] += BODY_SIGMA**2 * noise * np.eye(3) + _by_body(sights, J, lever, person.body.ends.cov, len(t))
+    cov[:, 2, 2] += UPRIGHT_SIGMA**2
     belief = Gaussian(belief.mean, cov)
     residual = np.full((*seen.shape, 2), np.nan)
     residual[sights.owner, sights.camera] = sights.z - pixels
@@ -136,13 +138,14 @@ def _filtered(
 ) -> Gaussian:
     """Beliefs (T, 6) with the measurement noise scaled, smoothed where that is asked for."""
     scaled = Sights(sights.owner, sights.camera, sights.z, sights.R * noise, sights.dt)
-    belief = Gaussian(person.start.mean, person.start.cov * START_DOUBT**2)
+    start = Gaussian(person.start.mean, person.start.cov * START_DOUBT**2)
+    belief = at_rest(start, sigma_a, config.filter)
     step = _pairwise_step(scaled, P, state[:, :3]) if config.fusion.method == "closed-loop" else None
     bank: Bank | None = None
     prior, posterior, transitions = [], [], []
     bounds = np.searchsorted(scaled.owner, np.arange(len(t) + 1))
     for k in range(len(t)):
-        F, Q = motion(t[k] - t[k - 1] if k else 0.0, sigma_a, config.filter.sigma_z)
+        F, Q = held_motion(float(t[k] - t[k - 1]) if k else 0.0, sigma_a, config.filter)
         ahead = gaussian.predict(belief, F, Q) if k else belief
         now = slice(bounds[k], bounds[k + 1])
         if now.start == now.stop:
@@ -163,13 +166,12 @@ def _filtered(
         Gaussian(np.stack([b.mean for b in beliefs]), np.stack([b.cov for b in beliefs]))
         for beliefs in (posterior, prior)
     )
-    if not config.smooth:
-        return filtered
-    return rauch_tung_striebel(filtered, predicted, np.stack(transitions))
+    settled = rauch_tung_striebel(filtered, predicted, np.stack(transitions)) if config.smooth else filtered
+    return Gaussian(settled.mean[:, :6], settled.cov[:, :6, :6])
 
 
 def _pairwise_step(sights: Sights, P: Array, near: Array) -> Callable[[int, Gaussian], Gaussian]:
-    """The closed loop's step k from a prediction (6,), all pairs of all instants triangulated at once."""
+    """The closed loop's step k from a prediction (9,), all pairs of all instants triangulated at once."""
     pairs = pair_up(sights, P, near)
     order = np.argsort(pairs.owner, kind="stable")
     y, R = pairs.y[order], pairs.R[order]

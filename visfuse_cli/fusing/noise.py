@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from visfuse_cli.fusing.estimate import Sights
-from visfuse_cli.fusing.tracker import motion
+from visfuse_cli.fusing.settings import FilterSettings
+from visfuse_cli.fusing.tracker import at_rest, held_motion
 from visfuse_cli.maths import gaussian
 from visfuse_cli.records import Array, Gaussian
 
@@ -18,7 +19,7 @@ USUAL = 1.0  # times the nominal variance
 LIMITS = (0.05, 100.0)
 POOR = 4.0  # times a camera's usual variance: where a side was hidden, what is left says little about noise
 THIN_S = 0.25  # s between looks that do not share a step of the person's
-GRID = np.array([0.05, 0.08, 0.13, 0.21, 0.34, 0.55, 0.9, 1.5, 2.5])  # m/s^2 per root Hz
+GRID = np.array([0.02, 0.03, 0.05, 0.08, 0.13, 0.21, 0.34, 0.55, 0.9, 1.5, 2.5])  # m/s^2 per root Hz
 GRID_SIGMA = 1.5  # of the logarithm of how hard people turn, before anything is known of one
 
 
@@ -53,11 +54,12 @@ def disagreement(sights: Sights, residual: Array, t: Array) -> tuple[float, floa
     return float(np.clip(over_batch, *LIMITS)), float(np.clip(in_one, *LIMITS))
 
 
-def restlessness(y: Array, R: Array, t: Array, expected: float, sigma_z: float, start: Gaussian) -> float:
+def restlessness(y: Array, R: Array, t: Array, settings: FilterSettings, start: Gaussian) -> float:
     """How hard (m/s^2 per root Hz) a person turns: the likeliest of a grid for measured places y (T, 3), R (T, 3, 3).
 
     Places THIN_S apart are predicted from each other, in several phases; NaN where nothing was measured.
     """
+    expected = settings.sigma_a
     known = np.flatnonzero(np.isfinite(y).all(axis=1))
     if len(known) < 4 or t[known[-1]] - t[known[0]] < 4 * THIN_S:
         return expected
@@ -65,20 +67,22 @@ def restlessness(y: Array, R: Array, t: Array, expected: float, sigma_z: float, 
     step = max(1, round(THIN_S / float(np.median(np.diff(t)))))
     phases = range(0, min(step, 4))
     for phase in phases:
-        score += _likelihood(y, R, t, known[phase::step], sigma_z, start) / len(phases)
+        score += _likelihood(y, R, t, known[phase::step], settings, start) / len(phases)
     return float(np.exp(_peak(np.log(GRID), score)))
 
 
-def _likelihood(y: Array, R: Array, t: Array, used: NDArray[np.intp], sigma_z: float, start: Gaussian) -> Array:
+def _likelihood(
+    y: Array, R: Array, t: Array, used: NDArray[np.intp], settings: FilterSettings, start: Gaussian
+) -> Array:
     """Log-likelihoods of a grid of motions for the places `used`."""
-    H = np.eye(3, 6)
-    mean = np.tile(np.concatenate([y[used[0]], np.zeros(3)]), (len(GRID), 1))
-    cov = np.tile(start.cov, (len(GRID), 1, 1))
-    cov[:, :3, :] = cov[:, :, :3] = 0.0
-    cov[:, :3, :3] = R[used[0]]
-    belief, total = Gaussian(mean, cov), np.zeros(len(GRID))
+    H = np.eye(3, 9)
+    cov = start.cov.copy()
+    cov[:3, :] = cov[:, :3] = 0.0
+    cov[:3, :3] = R[used[0]]
+    belief = at_rest(Gaussian(np.concatenate([y[used[0]], np.zeros(3)]), cov), GRID, settings)
+    total = np.zeros(len(GRID))
     for before, k in pairwise(used.tolist()):
-        F, Q = motion(t[k] - t[before], GRID, sigma_z)
+        F, Q = held_motion(float(t[k] - t[before]), GRID, settings)
         belief = gaussian.predict(belief, F, Q)
         belief, innovation = gaussian.update(belief, y[k] - belief.mean[:, :3], H, R[k])
         total += innovation.log_likelihood

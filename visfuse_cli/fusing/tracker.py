@@ -11,10 +11,10 @@ from visfuse_cli.fusing.audit import Audit
 from visfuse_cli.fusing.body import usual_body
 from visfuse_cli.fusing.estimate import Sights, at_one_time, consistent, fuse
 from visfuse_cli.fusing.person import History, Person
-from visfuse_cli.fusing.settings import FuseConfig
+from visfuse_cli.fusing.settings import FilterSettings, FuseConfig
 from visfuse_cli.maths import fusion_rivals, gaussian
 from visfuse_cli.maths.assignment import gate_size
-from visfuse_cli.maths.motion import constant_velocity, constant_velocity_noise
+from visfuse_cli.maths.motion import constant_velocity, constant_velocity_noise, held_acceleration
 from visfuse_cli.records import Array, Gaussian, Sighting
 
 PRIOR_LOOKS = 12.0  # looks that the usual height and width count for
@@ -34,10 +34,32 @@ class Newcomer:
 def motion(dt: float, sigma_a: Array | float, sigma_z: Array | float) -> tuple[Array, Array]:
     """F (6, 6) and Q (..., 6, 6) over dt s; white acceleration sigma_a (...) along the ground, sigma_z upwards."""
     unit = constant_velocity_noise(dt, 1.0, 3)
-    level, up = np.asarray(sigma_a, dtype=float) ** 2, np.asarray(sigma_z, dtype=float) ** 2
-    level, up = np.broadcast_arrays(level, up)
-    density = np.stack([level, level, up, level, level, up], axis=-1)
+    density = np.tile(_densities(sigma_a, sigma_z), 2)
     return constant_velocity(dt, 3), unit * density[..., None]
+
+
+def held_motion(dt: float, sigma_a: Array | float, settings: FilterSettings) -> tuple[Array, Array]:
+    """F (9, 9) and Q (..., 9, 9) over dt s with the acceleration as a state, for sigma_a (...) along the ground."""
+    F, unit = held_acceleration(round(dt, 9), settings.hold_s)
+    density = _densities(sigma_a, settings.sigma_z)
+    Q = np.einsum("ab,...i,ij->...aibj", unit, density, np.eye(3))
+    return np.asarray(np.kron(F, np.eye(3))), Q.reshape(*density.shape[:-1], 9, 9)
+
+
+def at_rest(belief: Gaussian, sigma_a: Array | float, settings: FilterSettings) -> Gaussian:
+    """A belief (6,) with the acceleration (..., 9) as it is for sigma_a (...) when nothing is known of it."""
+    variance = _densities(sigma_a, settings.sigma_z) / (2 * settings.hold_s)
+    cov = np.zeros((*variance.shape[:-1], 9, 9))
+    cov[..., :6, :6] = belief.cov
+    cov[..., 6:, 6:] = variance[..., None] * np.eye(3)
+    mean = np.concatenate([belief.mean, np.zeros(3)])
+    return Gaussian(np.broadcast_to(mean, (*variance.shape[:-1], 9)), cov)
+
+
+def _densities(sigma_a: Array | float, sigma_z: Array | float) -> Array:
+    """Of the acceleration along x, y and z (..., 3) m^2 s^-3."""
+    level, up = np.broadcast_arrays(np.asarray(sigma_a, dtype=float) ** 2, np.asarray(sigma_z, dtype=float) ** 2)
+    return np.stack([level, level, up], axis=-1)
 
 
 def beginning(place: Gaussian, config: FuseConfig) -> Gaussian:

@@ -1,6 +1,6 @@
 """The closed loop of local and global estimates, and the centralised filter that bounds it (Wu 2010, sec. 3).
 
-Beliefs are Gaussian over [position (3), velocity (3)], T people at once; what is measured comes as flat rows, each
+Beliefs are Gaussian over [position (3), velocity (3), ...], T people at once; what is measured comes as flat rows, each
 with the person it belongs to. A pair of cameras measures a point (3,) m, its covariance made from each camera's noise
 times the number of pairs that camera is in: so the sum over pairs counts every pixel once.
 """
@@ -16,18 +16,22 @@ from visfuse_cli.maths.multiview import project
 from visfuse_cli.records import Array, Gaussian, Innovation
 
 Rows = NDArray[np.intp]
-C = np.eye(3, 6)  # a pair measures the position: Wu 2010, eqs. 3, 11
+
+
+def position(states: int) -> Array:
+    """C (3, states): a pair measures the position. Wu 2010, eqs. 3, 11."""
+    return np.eye(3, states)
 
 
 def local_estimates(prior: Gaussian, y: Array, R: Array) -> tuple[Gaussian, Innovation]:
-    """Local estimates (M, 6) after each pair's own measurement y (M, 3), R (M, 3, 3). Wu 2010, eqs. 4-5."""
-    return gaussian.update(prior, y - prior.mean[..., :3], C, R)
+    """Local estimates (M, n) after each pair's own measurement y (M, 3), R (M, 3, 3). Wu 2010, eqs. 4-5."""
+    return gaussian.update(prior, y - prior.mean[..., :3], position(prior.mean.shape[-1]), R)
 
 
 def closed_loop(prior: Gaussian, owner: Rows, y: Array, R: Array) -> Gaussian:
-    """Global estimate (T, 6) from pairs that all began with the fed-back one. Wu 2010, eqs. 12-24, corrected.
+    """Global estimate (T, n) from pairs that all began with the fed-back one. Wu 2010, eqs. 12-24, corrected.
 
-    prior (T, 6) is what was fed back, predicted; owner (M,) names the person of each pair's y (M, 3), R (M, 3, 3).
+    prior (T, n) is what was fed back, predicted; owner (M,) names the person of each pair's y (M, 3), R (M, 3, 3).
     The corrections are summed and P^-1 grows by each pair's own gain in information; who was measured by no pair keeps
     the prediction. Raises LinAlgError where a covariance is not positive definite.
     """
@@ -48,15 +52,16 @@ def closed_loop(prior: Gaussian, owner: Rows, y: Array, R: Array) -> Gaussian:
 
 
 def central(prior: Gaussian, owner: Rows, P: Array, z: Array, R: Array) -> Gaussian:
-    """Estimate (T, 6) from all pixels at once: what no fusion of local estimates can better.
+    """Estimate (T, n) from all pixels at once: what no fusion of local estimates can better.
 
     owner (M,) names the person of each sighting z (M, 2) px, R (M, 2, 2), under its camera P (M, 3, 4). All are
-    linearised at the prior (T, 6). Raises LinAlgError where a covariance is not positive definite.
+    linearised at the prior (T, n). Raises LinAlgError where a covariance is not positive definite.
     """
     if not len(owner):
         return prior
     pixels, J = project(P, prior.mean[owner, :3])
-    H = np.concatenate([J, np.zeros_like(J)], axis=-1)
+    H = np.zeros((*J.shape[:-1], prior.mean.shape[-1]))
+    H[..., :3] = J
     off = z - pixels
     mean, cov = prior.mean.copy(), prior.cov.copy()
     # One sighting of every person a round: the order within a person changes nothing but the last digits.

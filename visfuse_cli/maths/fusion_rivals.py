@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from visfuse_cli.maths.fusion import C
+from visfuse_cli.maths.fusion import position
 from visfuse_cli.maths.gaussian import inverse, symmetrise, times, transpose
 from visfuse_cli.maths.multiview import project
 from visfuse_cli.records import Array, Gaussian
@@ -21,7 +21,7 @@ NEGLIGIBLE = 1e-4  # of the largest eigenvalue: with shared cameras some directi
 
 @dataclass(frozen=True, slots=True)
 class Bank:
-    """The local filters of one person: pairs (N, 2) of cameras, mean (N, 6), and the joint covariance (N, 6, N, 6).
+    """The local filters of one person: pairs (N, 2) of cameras, mean (N, n), and the joint covariance (N, n, N, n).
 
     The covariance between two filters comes from the motion's noise, which is one for all, and from shared cameras.
     """
@@ -32,39 +32,39 @@ class Bank:
 
     @property
     def local(self) -> Gaussian:
-        """The local beliefs (N, 6)."""
+        """The local beliefs (N, n)."""
         index = np.arange(len(self.pairs))
         return Gaussian(self.mean, self.joint[index, :, index, :])
 
 
 def started(belief: Gaussian, pairs: tuple[tuple[int, int], ...]) -> Bank:
-    """A bank whose filters all begin with the same belief (6,)."""
+    """A bank whose filters all begin with the same belief (n,)."""
     count = len(pairs)
-    joint = np.broadcast_to(belief.cov[None, :, None, :], (count, 6, count, 6)).copy()
+    size = len(belief.mean)
+    joint = np.broadcast_to(belief.cov[None, :, None, :], (count, size, count, size)).copy()
     return Bank(pairs, np.tile(belief.mean, (count, 1)), joint)
 
 
 def predicted(bank: Bank, F: Array, Q: Array) -> Bank:
-    """Every filter one step ahead, F and Q (6, 6); the same noise strikes all. Wu 2010, eq. 6."""
-    count = len(bank.pairs)
+    """Every filter one step ahead, F and Q (n, n); the same noise strikes all. Wu 2010, eq. 6."""
     joint = np.einsum("ab,ibjc,dc->iajd", F, bank.joint, F) + Q[None, :, None, :]
-    return Bank(bank.pairs, bank.mean @ F.T, joint.reshape(count, 6, count, 6))
+    return Bank(bank.pairs, bank.mean @ F.T, joint)
 
 
 def updated(bank: Bank, rows: NDArray[np.intp], y: Array, noise: Array) -> Bank:
     """Filters `rows` (M,) after their measurements y (M, 3), noise (M, M, 3, 3) between them. Wu 2010, eqs. 4-5."""
-    count = len(bank.pairs)
+    count, size = bank.mean.shape
     prior = bank.local
     own = np.arange(len(rows))
     S = symmetrise(prior.cov[rows][:, :3, :3] + noise[own, own])
-    gain = np.zeros((count, 6, 3))
+    gain = np.zeros((count, size, 3))
     gain[rows] = transpose(np.linalg.solve(S, prior.cov[rows][:, :3]))
     mean = bank.mean.copy()
     mean[rows] += times(gain[rows], y - bank.mean[rows, :3])
-    keep = np.eye(6) - gain @ C
+    keep = np.eye(size) - gain @ position(size)
     joint = np.einsum("iab,ibjc,jdc->iajd", keep, bank.joint, keep)
-    six = np.arange(6)
-    joint[np.ix_(rows, six, rows, six)] += np.einsum("iab,ijbc,jdc->iajd", gain[rows], noise, gain[rows])
+    every = np.arange(size)
+    joint[np.ix_(rows, every, rows, every)] += np.einsum("iab,ijbc,jdc->iajd", gain[rows], noise, gain[rows])
     return Bank(bank.pairs, mean, joint)
 
 
@@ -81,7 +81,7 @@ def pair_noise(P: Array, R: Array, pairs: NDArray[np.intp], point: Array, cov: A
 
 
 def naive(bank: Bank) -> Gaussian:
-    """Convex combination as if the local estimates (N, 6) were independent ("Austere"): (6,)."""
+    """Convex combination as if the local estimates (N, n) were independent ("Austere"): (n,)."""
     local = bank.local
     information = inverse(local.cov)
     cov = inverse(information.sum(axis=0))
@@ -89,21 +89,20 @@ def naive(bank: Bank) -> Gaussian:
 
 
 def kim(bank: Bank) -> Gaussian:
-    """The most likely state (6,) given all local estimates and what correlates them (Kim 1994)."""
-    size = 6 * len(bank.pairs)
-    sigma = symmetrise(bank.joint.reshape(size, size))
+    """The most likely state (n,) given all local estimates and what correlates them (Kim 1994)."""
+    sigma = symmetrise(bank.joint.reshape(bank.mean.size, bank.mean.size))
     scale = np.sqrt(np.diagonal(sigma))
     values, vectors = np.linalg.eigh(sigma / np.outer(scale, scale))
     used = values > NEGLIGIBLE * values[-1]
     # Directions without noise repeat what others say, so that they are left out and not divided by.
     half = (vectors[:, used] / np.sqrt(values[used])).T / scale
-    E = half @ np.tile(np.eye(6), (len(bank.pairs), 1))
+    E = half @ np.tile(np.eye(bank.mean.shape[1]), (len(bank.pairs), 1))
     cov = inverse(E.T @ E)
     return Gaussian(cov @ (E.T @ (half @ bank.mean.ravel())), cov)
 
 
 def covariance_intersection(bank: Bank) -> Gaussian:
-    """The convex combination (6,) with the smallest determinant that holds for any correlation of the local estimates.
+    """The convex combination (n,) with the smallest determinant that holds for any correlation of the local estimates.
 
     The weights maximise log det of the combined information by the multiplicative rounds of optimal design.
     """
@@ -112,6 +111,6 @@ def covariance_intersection(bank: Bank) -> Gaussian:
     weights = np.full(len(bank.pairs), 1 / len(bank.pairs))
     for _ in range(ROUNDS):
         cov = inverse(np.einsum("i,iab->ab", weights, information))
-        weights = weights * np.einsum("ab,iba->i", cov, information) / 6
+        weights = weights * np.einsum("ab,iba->i", cov, information) / len(cov)
     cov = inverse(np.einsum("i,iab->ab", weights, information))
     return Gaussian(cov @ np.einsum("i,iab,ib->a", weights, information, local.mean), cov)

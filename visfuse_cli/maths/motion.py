@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.linalg import expm
 
 from visfuse_cli.maths.angles import wrap
 from visfuse_cli.maths.gaussian import symmetrise, transpose
@@ -43,6 +46,20 @@ def constant_acceleration_noise(dt: ArrayLike, q: ArrayLike, dims: int = 2) -> A
     dt, q = np.broadcast_arrays(np.asarray(dt, dtype=float), np.asarray(q, dtype=float))
     pp, pv, pa, va = dt**5 / 20, dt**4 / 8, dt**3 / 6, dt**2 / 2
     return _each_axis([[q * pp, q * pv, q * pa], [q * pv, q * dt**3 / 3, q * va], [q * pa, q * va, q * dt]], dims)
+
+
+@lru_cache(maxsize=256)
+def held_acceleration(dt: float, hold: float) -> tuple[Array, Array]:
+    """F (3, 3), and Q (3, 3) at unit density, of one axis over dt s whose acceleration is forgotten within `hold` s.
+
+    Singer's model: seen over longer than `hold` the acceleration is white, with the density that multiplies Q
+    (m^2 s^-3). By Van Loan's matrix exponential.
+    """
+    rate = np.array([[0.0, 1, 0], [0, 0, 1], [0, 0, -1 / hold]])
+    drive = np.diag([0.0, 0, 1 / hold**2])
+    both = expm(np.block([[-rate, drive], [np.zeros((3, 3)), rate.T]]) * dt)
+    F = both[3:, 3:].T
+    return F, np.asarray(symmetrise(F @ both[:3, 3:]))
 
 
 def drifting_point(dt: ArrayLike, dims: int = 2) -> Array:
