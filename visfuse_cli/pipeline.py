@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import queue
 import signal
 import sys
@@ -24,6 +25,7 @@ from visfuse_cli.threads import thread_cap
 
 T = TypeVar("T")
 AHEAD = 3  # pictures that wait between two threads: enough to even out, too few to fill memory
+GAP = 2.5  # intervals without a frame of the leading view that are bridged
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
@@ -99,12 +101,17 @@ class Run:
                     return
 
     def synchronise(
-        self, sources: Mapping[str, VideoSource], tolerance_s: float, offsets: Mapping[str, float] | None = None
+        self,
+        sources: Mapping[str, VideoSource],
+        tolerance_s: float,
+        offsets: Mapping[str, float] | None = None,
+        interval_s: float | None = None,
     ) -> Iterator[FrameSet]:
         """Sets of frames by time: the first view leads, each other one adds its nearest frame within `tolerance_s`.
 
         `offsets` (s by view) are added to a view's own times to reach the shared clock; all times come out on the
-        leading view's. A frame belongs to one set at most: to that whose time is nearest to its own.
+        leading view's. A frame belongs to one set at most: to that whose time is nearest to its own. With `interval_s`
+        sets go on, so far apart, where the leading view has a gap or has ended, until the last view ends.
         """
         leader, *others = sources
         shift = {view: (offsets or {}).get(view, 0.0) - (offsets or {}).get(leader, 0.0) for view in sources}
@@ -112,18 +119,16 @@ class Run:
             streams = {view: stack.enter_context(ahead(source.frames)) for view, source in sources.items()}
             cursors = {view: _Cursor(self._waited(streams[view]), shift[view]) for view in others}
             bar = stack.enter_context(self._bar(sources[leader].frame_count))
-            leading = self._waited(streams[leader])
-            frame = next(leading, None)
-            while frame is not None and self.stopped_by is None:
-                following = next(leading, None)
-                found = {leader: frame}
+            for index, t, following, frame in _instants(self._waited(streams[leader]), cursors, interval_s):
+                found = {} if frame is None else {leader: frame}
                 for view, cursor in cursors.items():
-                    match = cursor.nearest(frame.t, tolerance_s, None if following is None else following.t)
+                    match = cursor.nearest(t, tolerance_s, following)
                     if match is not None:
                         found[view] = match
-                yield FrameSet(frame.t, found, tuple(view for view in others if view not in found))
+                if self.stopped_by is not None:
+                    return
+                yield FrameSet(t, found, tuple(view for view in sources if view not in found), index)
                 bar.update()
-                frame = following
 
     @contextmanager
     def background(self, sink: Sink) -> Iterator[Sink]:
@@ -156,6 +161,34 @@ class Run:
         return tqdm(total=total, unit=" frames", file=sys.stderr, disable=not self.progress, leave=False)
 
 
+def _instants(
+    leading: Iterator[Frame], cursors: Mapping[str, _Cursor], interval_s: float | None
+) -> Iterator[tuple[int, float, float | None, Frame | None]]:
+    """The instants of sets: index, time, time of the following one if there is one, and the leading view's frame."""
+    frame = next(leading, None)
+    while frame is not None:
+        following = next(leading, None)
+        due = None if following is None else following.t
+        empty = _between(frame.t, due, interval_s)
+        upcoming = next(empty, due)
+        yield frame.index, frame.t, upcoming, frame
+        number = frame.index
+        while upcoming is not None and upcoming != due and any(not cursor.ended for cursor in cursors.values()):
+            t, upcoming, number = upcoming, next(empty, due), number + 1
+            yield number if due is None else -1, t, upcoming, None
+        frame = following
+
+
+def _between(t: float, due: float | None, interval_s: float | None) -> Iterator[float]:
+    """Times every `interval_s` after t and well before `due`, or without end."""
+    if interval_s is None or (due is not None and due - t < GAP * interval_s):
+        return
+    for number in itertools.count(1):
+        if due is not None and t + (number + 0.5) * interval_s > due:
+            return
+        yield t + number * interval_s
+
+
 class _Cursor:
     """Walks one view's frames, on the leading view's clock, along rising times; holds two of them."""
 
@@ -164,10 +197,17 @@ class _Cursor:
         self._before: Frame | None = None
         self._after = next(self._frames, None)
 
+    @property
+    def ended(self) -> bool:
+        """Whether no frame is left."""
+        return self._before is None and self._after is None
+
     def nearest(self, t: float, tolerance_s: float, following: float | None) -> Frame | None:
         """The frame nearest to `t`, unless it is too far off or nearer to the leading view's following frame."""
         while self._after is not None and self._after.t <= t:
             self._before, self._after = self._after, next(self._frames, None)
+        if self._before is not None and t - self._before.t > tolerance_s:
+            self._before = None
         candidates = [frame for frame in (self._before, self._after) if frame is not None]
         best = min(candidates, key=lambda frame: abs(frame.t - t), default=None)
         if best is None or abs(best.t - t) > tolerance_s:

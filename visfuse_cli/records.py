@@ -30,11 +30,15 @@ class Frame:
 
 @dataclass(frozen=True, slots=True)
 class FrameSet:
-    """The frames of several views that belong to one instant; a view without a frame is in `missing`."""
+    """The frames of several views that belong to one instant; a view without a frame is in `missing`.
+
+    `index` is that of the leading view's frame, or goes on counting once that has ended; -1 in its gaps.
+    """
 
     t: float
     frames: dict[str, Frame]
     missing: tuple[str, ...]
+    index: int = -1
 
 
 @dataclass(frozen=True, slots=True)

@@ -174,8 +174,7 @@ def _follow(
     run_: Run,
 ) -> Iterator[list[Person]]:
     """Follow everybody through the footage; yields, set by set, whom nobody follows any more."""
-    for instant in run_.synchronise(sources, _tolerance(sources), offsets):
-        frame = instant.frames[scene.names[0]].index
+    for instant in run_.synchronise(sources, _tolerance(sources), offsets, _spacing(sources)):
         with run_.stage("detect"):
             eyes.detect(instant)
         with run_.stage("fuse"):
@@ -183,13 +182,13 @@ def _follow(
         with run_.stage("look"):
             sightings = eyes.look(tracker)
         with run_.stage("fuse"):
-            tracker.update(frame, sightings)
+            tracker.update(instant.index, sightings)
             inside, clear = visibility(tracker.beliefs, eyes.sizes, eyes.P, tracker.config)
             tracker.miss(clear & eyes.open, sightings)
             tracker.watch(clear & eyes.open)
             ended = tracker.end(instant.t, np.count_nonzero(inside, axis=1))
         with run_.stage("newcomers"):
-            tracker.begin(frame, instant.t, eyes.newcomers(tracker))
+            tracker.begin(instant.index, instant.t, eyes.newcomers(tracker))
         with run_.stage("learn"):
             eyes.learn(instant.t, tracker)
         yield ended
@@ -249,7 +248,7 @@ def _settle(
             continue
         path = replace(path, residual=path.residual * eyes.zoom[:, None])
         spool.add(track_record(path, scene.names, scene.R, scene.t))
-        results.begun.append((int(path.frame[0]), path.id))
+        results.begun.append((int(path.frame[path.told][0]), path.id))
         _contribute(path, results)
         places = np.concatenate([results.extent, path.belief.mean[:, :2]])
         results.extent = np.stack([places.min(axis=0), places.max(axis=0)])
@@ -297,8 +296,8 @@ def _annotate(
             sinks[name] = stack.enter_context(run_.background(stack.enter_context(writer)))
         writer = VideoWriter(folder / "mosaic.mp4", *mosaic_size(scene.views), rate)
         whole = stack.enter_context(run_.background(stack.enter_context(writer)))
-        instants, again = tee(run_.synchronise(sources, _tolerance(sources), offsets))
-        frames = (instant.frames[scene.names[0]].index for instant in again)
+        instants, again = tee(run_.synchronise(sources, _tolerance(sources), offsets, _spacing(sources)))
+        frames = (instant.index for instant in again)
         drawn = _drawn(scene, request.config, spool, results)
         for people, instant in zip(active(drawn, frames), instants, strict=True):
             for view in scene.views:
@@ -313,6 +312,11 @@ def _annotate(
 def _tolerance(sources: dict[str, VideoSource]) -> float:
     """How far (s) a frame may be from the instant of its set: half of the longest interval, and a little."""
     return 0.55 * _interval(sources)
+
+
+def _spacing(sources: dict[str, VideoSource]) -> float:
+    """The time (s) from one set to the next where the first camera has nothing."""
+    return 1 / next(iter(sources.values())).nominal_rate
 
 
 def _interval(sources: dict[str, VideoSource]) -> float:

@@ -63,6 +63,10 @@ def conclude(person: Person, P: Array, config: FuseConfig) -> Path | None:
     pairs = np.flatnonzero(np.count_nonzero(seen, axis=1) >= 2)
     if t[pairs[-1]] - t[pairs[0]] < config.life.min_duration_s - 1e-9:
         return None
+    frame = np.array(person.history.frame)
+    told = (seen.any(axis=1) | (np.array(person.history.denied) < DENIED)) & (frame >= 0)
+    if not told.any():
+        return None
     state = person.history.state
     sights, lever = _sights(rows, seen, state, P, person.body.ends.mean)
     noise, sigma_a = 1.0, config.filter.sigma_a
@@ -82,14 +86,14 @@ def conclude(person: Person, P: Array, config: FuseConfig) -> Path | None:
     residual[sights.owner, sights.camera] = sights.z - pixels
     return Path(
         id=person.id,
-        frame=np.array(person.history.frame),
+        frame=frame,
         t=t,
         belief=belief,
         seen=seen,
         boxes=rows[:, :, BOX],
         residual=residual,
         weight=_weights(sights, J, seen.shape),
-        told=seen.any(axis=1) | (np.array(person.history.denied) < DENIED),
+        told=told,
         height=person.body.ends.height,
         noise=noise,
         sigma_a=sigma_a,
