@@ -162,7 +162,7 @@ def test_a_short_model_in_the_common_state_is_that_model():
 
 def test_the_periodic_model_swings_about_its_own_centre():
     models = Models(FilterSettings(kind="periodic"))
-    bank = models.start(Gaussian(np.array([7.0, 0, 0]), np.eye(3)), np.zeros(3))
+    bank = models.start(Gaussian(np.array([7.0, 0, 0]), np.eye(3)), Gaussian(np.zeros(3), np.eye(3)))
     bank.beliefs.mean[0, 9] = 2.0  # 2 m to the right of its centre
     ahead = imm.combined(models.predict(bank, np.pi).filtered)  # half a swing at 1 rad/s
     np.testing.assert_allclose(ahead.mean[[0, 9]], [3.0, -2.0], atol=1e-9)

@@ -77,7 +77,7 @@ def start(
     identity: int, head: Head, config: ImmConfig, models: Courses, view: View, quad: Array, given: bool
 ) -> Target | None:
     """Begin with a target in a quad (4, 2) px of a view; None where it is not on the ground."""
-    sought = patches.template(view.levels, quad)
+    sought = patches.holding(view.levels, quad)
     target = Target(identity, head, config, models, np.ones(2), np.zeros(2), sought, given, view.t)
     at = target.anchor(quad)
     place = head.ground(at, view.gaze, target.height)
@@ -115,7 +115,7 @@ def follow(target: Target, view: View) -> None:
     if z is not None and found is not None:
         target.place, target.last_seen = z[:2], view.t
         if found[1].correlation < target.config.measure.fresh:
-            target.sought = patches.template(view.levels, quad)
+            target.sought = patches.holding(view.levels, quad)
     if not target.steps and sum(look.z is not None for look in target.looks) >= YOUNG:
         _begin(target)
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ from visfuse_cli.moving.models import P, V
 from visfuse_cli.moving.target import Target
 from visfuse_cli.records import Array, Gaussian
 
+FEWEST = 2  # measurements that make a part of a track
 Z95 = 1.959963984540054
 EGO_SHARE = 0.02  # of the camera's way: error of its pose that a static thing may seem to move by
 SLOWEST = 0.12  # m/s: what is slower on the whole is not said to move
@@ -30,19 +32,35 @@ class Settled:
     boxes: list[dict[str, Array]]
     measured: Array
     ahead: list[Gaussian | None]
-    nis: float
+    nis: Array  # of each measurement but the first
     size: Array
     ended_by: str
 
 
-def conclude(target: Target, pose_cov: Array) -> Settled | None:
+def conclude(target: Target, pose_cov: Callable[[int], Array]) -> Settled | None:
     """Settle a track; None where it was measured too rarely, or was found unaided and stands still.
 
-    pose_cov (T, 4, 4) is the covariance of the camera's position and yaw at the track's instants.
+    pose_cov tells the covariance (4, 4) of the camera's position and yaw at a frame. What was seen of the target before
+    it was away or lost comes first.
     """
-    life = target.config.life
+    chain = [target]
+    while (earlier := chain[-1].earlier) is not None:
+        chain.append(earlier)
+    parts = [part for each in chain[::-1] if (part := _part(each, pose_cov)) is not None]
+    if not parts:
+        return None
+    first, *others = parts
+    for other in others:
+        first = _joined(first, other)
+    if np.count_nonzero(first.measured) < target.config.life.min_frames:
+        return None
+    return first if target.given or _moved(target, first) else None
+
+
+def _part(target: Target, pose_cov: Callable[[int], Array]) -> Settled | None:
+    """What was seen of a target without a break; None where that is next to nothing."""
     measured = np.array([seen.measured for seen in target.history])
-    if np.count_nonzero(measured) < life.min_frames:
+    if np.count_nonzero(measured) < FEWEST:
         return None
     last = int(np.flatnonzero(measured)[-1]) + 1
     history, measured = target.history[:last], measured[:last]
@@ -53,22 +71,41 @@ def conclude(target: Target, pose_cov: Array) -> Settled | None:
     common = [imm.combined(bank) for bank in banks]
     mean = np.stack([belief.mean for belief in common])[:, :6]
     cov = np.stack([belief.cov for belief in common])[:, :6, :6]
-    nis = np.array([seen.nis for seen in history])[measured]
-    settled = Settled(
+    of_pose = _of_pose(mean, np.stack([pose_cov(seen.frame) for seen in history]), history)
+    return Settled(
         id=target.id,
         frame=[seen.frame for seen in history],
         t=np.array([seen.t for seen in history]),
-        belief=Gaussian(mean, cov + _of_pose(mean, pose_cov[:last], history)),
+        belief=Gaussian(mean, cov + of_pose),
         log_mu=np.stack([bank.log_mu for bank in banks]),
         names=target.models.names,
         boxes=[seen.boxes for seen in history],
         measured=measured,
         ahead=[seen.ahead for seen in history],
-        nis=float(np.mean(nis[1:])) if len(nis) > 1 else 0.0,
+        nis=np.array([seen.nis for seen in history])[measured][1:],
         size=target.size,
         ended_by=target.ended_by,
     )
-    return settled if target.given or _moved(target, settled) else None
+
+
+def _joined(first: Settled, then: Settled) -> Settled:
+    """Two parts of one track."""
+    keep = int(np.searchsorted(first.frame, then.frame[0]))  # it was still predicted as it was found again
+    belief = Gaussian(
+        np.concatenate([first.belief.mean[:keep], then.belief.mean]),
+        np.concatenate([first.belief.cov[:keep], then.belief.cov]),
+    )
+    return replace(
+        then,
+        frame=first.frame[:keep] + then.frame,
+        t=np.concatenate([first.t[:keep], then.t]),
+        belief=belief,
+        log_mu=np.concatenate([first.log_mu[:keep], then.log_mu]),
+        boxes=first.boxes[:keep] + then.boxes,
+        measured=np.concatenate([first.measured[:keep], then.measured]),
+        ahead=first.ahead[:keep] + then.ahead,
+        nis=np.concatenate([first.nis, then.nis]),
+    )
 
 
 def _of_pose(mean: Array, pose_cov: Array, history: list[Any]) -> Array:
@@ -129,7 +166,7 @@ def track_record(path: Settled, latency: float) -> dict[str, Any]:
             "distance": distance,
             "speed": mean_speed,
             "speed_ci95": [max(0.0, mean_speed - Z95 * doubt), mean_speed + Z95 * doubt],
-            "nis_mean": path.nis,
+            "nis_mean": float(np.mean(path.nis)) if len(path.nis) else 0.0,
             "nis_dof": 5,
             "size": path.size.tolist(),
             "ended": path.ended_by,

@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 
 from visfuse_cli.moving.settings import ImmConfig
-from visfuse_cli.moving.target import Head
+from visfuse_cli.moving.target import Head, Pair
 from visfuse_cli.records import Array, Image, StereoRig
 from visfuse_cli.vision import clusters
 from visfuse_cli.vision.flow import own_motion
 
 SAMPLES = 3000  # pixels that are clustered, at most
 FILLED = 0.3  # share of a region's box that moves by itself
+AROUND = np.array([0.2, 0.3])  # of its sides: around what is followed already nothing is looked for
 FARTHEST_M = 40.0
+WIDER, KEPT = 0.15, 0.6  # how far around a box its outline is looked for, and the least share of a side then left
+RIM = 3.0  # px from the edge of the picture
 SLOWEST = 0.15  # m/s that a region must do in the world
 
 
@@ -24,6 +28,15 @@ class _Candidate:
     box: Array  # [u0, v0, u1, v1] px
     seen: int
     motion: Array
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """What moves by itself: left quad (4, 2) px, velocity (3,) m/s in the world but along the axis, depth m."""
+
+    quad: Array
+    velocity: Array
+    depth: float
 
 
 class Finder:
@@ -40,6 +53,8 @@ class Finder:
             0, self._disparities, 5, 8 * 25, 32 * 25, 1, 31, 10, 60, 2
         )
         self._candidates: list[_Candidate] = []
+        self._before: tuple[Head, Future[Array]] | None = None
+        self._beside = ThreadPoolExecutor(1, "visfuse-depth")
 
     def _rectified(self, size: tuple[int, int]) -> tuple[tuple[Array, Array], tuple[Array, Array], Array, Array]:
         rig = self._rig
@@ -51,15 +66,15 @@ class Finder:
         ]
         return maps[0], maps[1], R1, P1[:, :3]
 
-    def depth(self, left: Image, right: Image) -> Array:
+    def _depth(self, left: Image, right: Image) -> Array:
         """Depth (H, W) m of the left view; infinite where nothing is known."""
         if self._maps is None:
-            disparity = self._matcher.compute(left, right).astype(float) / 16
+            disparity = self._matched(left, right)
             focal = self._rig.left.K[0, 0]
             return np.where(disparity > 0.5, focal * self._rig.baseline / np.maximum(disparity, 0.5), np.inf)
         one, other, R1, K = self._maps
         pair = [cv2.remap(view, *maps, cv2.INTER_LINEAR) for view, maps in ((left, one), (right, other))]
-        disparity = self._matcher.compute(*pair).astype(np.float32) / 16
+        disparity = self._matched(*pair)
         depth = np.where(disparity > 0.5, K[0, 0] * self._rig.baseline / np.maximum(disparity, 0.5), np.inf)
         # Back to the left view: where each of its pixels lies in the rectified picture.
         high, wide = depth.shape
@@ -70,19 +85,35 @@ class Finder:
         near = cv2.remap(depth.astype(np.float32), at[..., 0], at[..., 1], cv2.INTER_NEAREST, borderValue=np.inf)
         return np.asarray(near / np.maximum(rays[..., 2], 1e-6), dtype=float)
 
-    def look(
-        self, picture: Image, depth: Array, flow: Array, before: Head, now: Head, known: list[Array]
-    ) -> list[tuple[Array, Array]]:
-        """Left quads (4, 2) px and world velocities (3,) m/s of regions that moved for some frames, none `known`.
+    def _matched(self, left: Image, right: Image) -> Array:
+        """Disparity (H, W) px; the matcher leaves out as many columns as it tries disparities, so it gets them more."""
+        more = [cv2.copyMakeBorder(view, 0, 0, self._disparities, 0, cv2.BORDER_REPLICATE) for view in (left, right)]
+        return np.asarray(self._matcher.compute(*more)[:, self._disparities :].astype(np.float32) / 16, dtype=float)
 
-        known are boxes [x, y, w, h]; depth (H, W) m is that of the frame before, flow (H, W, 2) px
-        leads from it to this one.
-        """
+    def look(self, pair: Pair, grey: Image, known: list[Array]) -> list[Found]:
+        """What moved for some frames in the left view and is none of the `known` boxes [x, y, w, h]."""
+        before = self._before
+        right = cv2.cvtColor(pair.pictures["right"], cv2.COLOR_BGR2GRAY)
+        # The matcher works beside the rest: its depth is needed one pair later.
+        self._before = (pair.head, self._beside.submit(self._depth, grey, np.asarray(right, np.uint8)))
+        if before is None or pair.flow is None:
+            return []
+        head, depth = before[0], before[1].result()
+        mask, rest = self._moving(depth, pair.flow, head, pair.head)
+        for box in known:
+            low = np.maximum(box[:2] - AROUND * box[2:], 0).astype(int)
+            top = np.maximum(box[:2] + (1 + AROUND) * box[2:] + 1, 0).astype(int)
+            mask[low[1] : top[1], low[0] : top[0]] = 0
+        regions = self._regions(mask, rest, pair.pictures["left"])
+        return self._confirmed(regions, depth, rest, pair.flow, pair.head.t - head.t, pair.head)
+
+    def _moving(self, depth: Array, flow: Array, before: Head, now: Head) -> tuple[Image, Array]:
+        """Where (H, W) the flow is not what the camera's own motion gives at that depth, and what it leaves over."""
         R, t = now.R.T @ before.R, now.R.T @ (before.T - now.T)
         rest = flow - own_motion(depth, self._rig.left.K, R, t)
         usable = np.isfinite(depth) & (depth < FARTHEST_M) & np.isfinite(rest).all(axis=-1)
         if np.count_nonzero(usable) < 200:
-            return []
+            return np.zeros(depth.shape, np.uint8), rest
         middle = np.median(rest[usable], axis=0)
         spread = 1.4826 * np.median(np.abs(rest[usable] - middle))
         # Near things have more flow, and so more of its error.
@@ -90,11 +121,9 @@ class Finder:
         least = self._config.segmentation.residual_px + 3 * spread + 0.12 * np.nan_to_num(explained)
         mask = (usable & (np.linalg.norm(rest - middle, axis=-1) > least)).astype(np.uint8)
         mask = cv2.morphologyEx(mask, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
-        mask = cv2.morphologyEx(mask, cv2.MORPH_CLOSE, np.ones((7, 7), np.uint8))
-        regions = self._regions(np.asarray(mask, np.uint8), rest, depth, picture)
-        return self._confirmed(regions, depth, rest, now.t - before.t, now, known)
+        return np.asarray(cv2.morphologyEx(mask, cv2.MORPH_CLOSE, np.ones((7, 7), np.uint8)), np.uint8), rest
 
-    def _regions(self, mask: Image, rest: Array, depth: Array, picture: Image) -> list[tuple[Array, Array]]:
+    def _regions(self, mask: Image, rest: Array, picture: Image) -> list[tuple[Array, Array]]:
         """Boxes [u0, v0, u1, v1] and masks (H, W) of clusters of moving pixels. Jia 2008, sec. 2."""
         v, u = np.nonzero(mask)
         settings = self._config.segmentation
@@ -120,13 +149,10 @@ class Finder:
         return found
 
     def _confirmed(
-        self, regions: list[tuple[Array, Array]], depth: Array, rest: Array, dt: float, now: Head, known: list[Array]
-    ) -> list[tuple[Array, Array]]:
-        held = [np.array([box[0], box[1], box[0] + box[2], box[1] + box[3]]) for box in known]
+        self, regions: list[tuple[Array, Array]], depth: Array, rest: Array, flow: Array, dt: float, now: Head
+    ) -> list[Found]:
         kept, ready = [], []
         for box, own in regions:
-            if any(_shared(box, other) > 0.3 for other in held):
-                continue
             motion = np.median(rest[own], axis=0)
             away = float(np.median(depth[own]))
             velocity = now.R @ np.array([*(motion / np.diag(self._rig.left.K)[:2] * away / dt), 0.0])
@@ -135,13 +161,47 @@ class Finder:
             before = next((c for c in self._candidates if _shared(c.box, box) > 0.4), None)
             alike = before is not None and float(before.motion @ motion) > 0
             candidate = _Candidate(box, before.seen + 1 if before is not None and alike else 1, motion)
-            if candidate.seen >= self._config.life.confirm_frames:
-                u0, v0, u1, v1 = box
-                ready.append((np.array([[u0, v0], [u1, v0], [u1, v1], [u0, v1]]), velocity))
+            u0, v0, u1, v1 = box
+            unseen = self._rig.left.K[0, 0] * self._rig.baseline / away  # px at the left that the right view lacks
+            cut = u0 < unseen + RIM or u1 > rest.shape[1] - 1 - RIM  # it is coming in, or going out
+            if candidate.seen >= self._config.life.confirm_frames and not cut:
+                u0, v0, u1, v1 = self._tight(box, depth, away, flow)
+                ready.append(Found(np.array([[u0, v0], [u1, v0], [u1, v1], [u0, v1]]), velocity, away))
             else:
                 kept.append(candidate)
         self._candidates = kept
         return ready
+
+    def _tight(self, box: Array, depth: Array, away: float, flow: Array) -> Array:
+        """The box [u0, v0, u1, v1] no wider than what lies as far away, `away` m: flow alone runs over outlines.
+
+        depth (H, W) m is that of the frame before, from which flow (H, W, 2) px leads to the box's own.
+        """
+        moved = np.median(flow[int(box[1]) : int(box[3]) + 1, int(box[0]) : int(box[2]) + 1].reshape(-1, 2), axis=0)
+        more = WIDER * (box[2:] - box[:2])
+        low = np.maximum(np.floor(box[:2] - more - moved), 0).astype(int)
+        top = np.minimum(np.ceil(box[2:] + more - moved), [depth.shape[1] - 1, depth.shape[0] - 1]).astype(int)
+        disparity = self._rig.left.K[0, 0] * self._rig.baseline / depth[low[1] : top[1] + 1, low[0] : top[0] + 1]
+        own = self._rig.left.K[0, 0] * self._rig.baseline / away
+        near = np.abs(disparity - own) < max(1.0, 0.1 * own)
+        inner = box - np.tile(low + moved, 2)  # in the cut-out
+        columns = _run(near[max(int(inner[1]), 0) : int(inner[3]) + 1].mean(axis=0), (inner[0] + inner[2]) / 2)
+        left, right = np.array(columns) - 0.5 + low[0] + moved[0]
+        return np.array([left, box[1], right, box[3]]) if right - left > KEPT * (box[2] - box[0]) else box
+
+
+def _run(share: Array, middle: float) -> tuple[int, int]:
+    """First and one past the last of the places around the middle where a share is half of its largest or more.
+
+    Gaps of a third are passed over: depth has holes.
+    """
+    full = share >= 0.5 * max(float(share.max(initial=0.0)), 1e-9)
+    gap = np.ones(len(full) // 3 + 1, np.uint8)
+    full = np.pad(full, len(full)).astype(np.uint8)[None]
+    full = cv2.morphologyEx(full, cv2.MORPH_CLOSE, gap[None])[0, len(share) : 2 * len(share)] > 0
+    at = int(np.clip(round(middle), 0, len(full) - 1))
+    before, after = np.flatnonzero(~full[:at]), np.flatnonzero(~full[at:])
+    return int(before[-1]) + 1 if len(before) else 0, at + (int(after[0]) if len(after) else len(full) - at)
 
 
 def _shared(box: Array, other: Array) -> float:

@@ -36,12 +36,11 @@ class Models:
         self.names = tuple(INDEX) if settings.kind == "imm" else (settings.kind,)
         self._log_p = imm.transition(len(self.names), settings.stay)
 
-    def start(self, position: Gaussian, velocity: Array) -> Bank:
+    def start(self, position: Gaussian, velocity: Gaussian) -> Bank:
         """Every model from a place (3,) and a velocity (3,), equally likely."""
         mean, cov = np.zeros(SIZE), np.diag(SPARE)
-        mean[P], mean[V] = position.mean, velocity
-        cov[P, P] = position.cov
-        cov[V, V] = self._settings.start_speed**2 * np.eye(3)
+        mean[P], mean[V] = position.mean, velocity.mean
+        cov[P, P], cov[V, V] = position.cov, velocity.cov
         return imm.start(Gaussian(mean, cov), len(self.names))
 
     def predict(self, bank: Bank, dt: float) -> Step:

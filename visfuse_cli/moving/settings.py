@@ -83,6 +83,7 @@ class LifeSettings(Section):
 
     confirm_frames: int = Field(3, ge=1, le=100, description="frames in a row in which a region must move by itself")
     max_coast_s: float = Field(1.5, ge=0, le=60, description="s of prediction before a track ends")
+    memory_s: float = Field(10.0, ge=0, le=600, description="s for which who left or was lost is known again")
     min_frames: int = Field(6, ge=2, le=1000, description="measured frames that a track needs")
     min_moved: float = Field(0.4, ge=0, le=1000, description="m that a target found unaided must move in the world")
 

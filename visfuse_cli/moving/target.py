@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -12,15 +13,22 @@ from visfuse_cli.maths.imm import Bank, Step
 from visfuse_cli.maths.planes import in_right, projected, triangulated
 from visfuse_cli.moving.models import SIZE, Models, P, V
 from visfuse_cli.moving.settings import ImmConfig
-from visfuse_cli.records import Array, Gaussian, StereoRig
+from visfuse_cli.records import Array, Gaussian, Image, StereoRig
 from visfuse_cli.vision import patches
 from visfuse_cli.vision.disparity import region_shift
-from visfuse_cli.vision.patches import Grey, Template
+from visfuse_cli.vision.looks import looks, unlike
+from visfuse_cli.vision.patches import Alignment, Grey, Template
 
 STEP = 1e-3  # m, m/s: of the numerical Jacobian
 GATE = 1 - 1e-7
 SEARCH = 0.8  # of its size: how far around the prediction a lost target is looked for
+STRETCH = 0.2  # by which a target's picture may be off the size that its distance gives it
 TRUST = 4.0  # times an alignment's own covariance
+NEAREST = 0.2  # m before the camera
+REACH = 3.0  # px of disparity around the expected one, at least
+COASTED_S = 0.25  # after which a target that is found again must look as it did
+ALIKE = 45.0  # grey levels: looks that differ by less may be of one thing
+KEEP_LOOKS = 0.95  # of what a target looked like, from frame to frame
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,6 +49,22 @@ class Head:
 
 
 @dataclass(frozen=True, slots=True)
+class Pair:
+    """One pair of straight pictures: number, head, pictures by view, the left one's pyramid, and the flow to it, px."""
+
+    frame: int
+    head: Head
+    pictures: Mapping[str, Image]
+    levels: list[Grey]
+    flow: Array | None
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height, px."""
+        return self.levels[0].shape[1], self.levels[0].shape[0]
+
+
+@dataclass(frozen=True, slots=True)
 class Seen:
     """One frame: its number, time, head, boxes by view, whether it was measured, and the bank before and after."""
 
@@ -56,7 +80,10 @@ class Seen:
 
 @dataclass(slots=True)
 class Target:
-    """A target that is followed; `size` (2,) m of its visible surface."""
+    """A target that is followed; `size` (2,) m of its visible surface, `looks` (bands, 3) its colours.
+
+    `earlier` is what was seen of it before it was lost or away.
+    """
 
     id: int
     rig: StereoRig
@@ -65,12 +92,14 @@ class Target:
     bank: Bank
     size: Array
     sought: Template
+    looks: Array
     head: Head
     given: bool
     last_seen: float
     history: list[Seen] = field(default_factory=list)
     ended_by: str = ""
     away: float = 0.0  # m that the camera moved since the target began
+    earlier: Target | None = None
 
     @property
     def belief(self) -> Gaussian:
@@ -78,106 +107,146 @@ class Target:
         return imm.combined(self.bank)
 
 
+@dataclass(frozen=True, slots=True)
+class Expected:
+    """Where a target is thought to be: the step that led there, its quads (4, 2) by view, and its depth m."""
+
+    step: Step
+    quads: dict[str, Array]
+    depth: float
+    doubt: float  # of the depth, as a share of it
+
+
 def start(
     identity: int,
     rig: StereoRig,
     config: ImmConfig,
     models: Models,
-    views: dict[str, list[Grey]],
+    pair: Pair,
     left: Array,
     right: Array,
-    frame: int,
-    head: Head,
-    velocity: Array,
+    velocity: Gaussian,
     given: bool,
 ) -> Target | None:
     """Begin with a target in left and right quads (4, 2) px; None where it lies behind the camera."""
-    shifted = region_shift(views, left, (right - left).mean(axis=0), config.measure.good)
-    if shifted is not None:
-        right = left + shifted[0]
+    found = _across(rig, pair, left, right, 2 * REACH)
+    if found is not None:
+        right = found[0]
     place = triangulated(rig, left.mean(axis=0), right.mean(axis=0))
-    if not np.isfinite(place).all() or place[2] <= 0.1:
+    if not np.isfinite(place).all() or place[2] <= NEAREST:
         return None
-    focal = np.diag(rig.left.K)[:2]
+    focal, head = np.diag(rig.left.K)[:2], pair.head
     size = np.array(patches.side(left)) * place[2] / focal
     rays = place / place[2]
     sigma = place[2] ** 2 / (focal[0] * rig.baseline) * 0.7
     cov = sigma**2 * np.outer(rays, rays) + (0.005 * place[2]) ** 2 * np.eye(3)
     bank = models.start(Gaussian(head.outside(place), head.R @ cov @ head.R.T), velocity)
-    target = Target(
-        identity, rig, config, models, bank, size, patches.template(views["left"], left), head, given, head.t
-    )
+    sought, seen = patches.holding(pair.levels, left), looks(pair.pictures["left"], left)
+    target = Target(identity, rig, config, models, bank, size, sought, seen, head, given, head.t)
     nothing = np.zeros_like(bank.beliefs.cov)
     first = Step(bank.beliefs, nothing + np.eye(SIZE), nothing, bank.beliefs, bank.log_mu, bank)
-    boxes = {"left": _box(left), "right": _box(right)}
-    target.history.append(Seen(frame, head.t, head, boxes, True, first, 0.0, None))
+    boxes = {"left": box_of(left), "right": box_of(right)}
+    target.history.append(Seen(pair.frame, head.t, head, boxes, True, first, 0.0, None))
     return target
 
 
-def follow(target: Target, views: dict[str, list[Grey]], flow: Array | None, frame: int, head: Head) -> None:
-    """One frame further: predict, look, update. `flow` (H, W, 2) px since the frame before, where it is known."""
-    before = target.head
-    step = target.models.predict(target.bank, head.t - before.t)
-    target.away += float(np.linalg.norm(head.T - before.T))
-    target.bank, target.head = step.filtered, head
-    quads = _expected_quads(target)
-    found = _look(target, views, quads) if quads is not None else None
-    nis, measured = 0.0, False
-    if found is not None:
-        left, right, R = found
-        z, R = _measurement(target, left, right, R, flow, head.t - before.t)
-        updated = _updated(target, step, z, R, head, before)
-        if updated is not None:
-            step, nis = updated
-            target.bank = step.filtered
-            measured, quads = True, {"left": left, "right": right}
-            target.last_seen = head.t
-            _refresh(target, views, left, head)
-    boxes = {} if quads is None else {view: _box(quad) for view, quad in quads.items()}
-    later = None
-    if target.config.latency > 0:
-        later = imm.combined(target.models.predict(target.bank, target.config.latency).filtered)
-    target.history.append(Seen(frame, head.t, head, boxes, measured, step, nis, later))
+def expect(target: Target, head: Head) -> Expected:
+    """Where the target is thought to be as the head is there; its quads are empty behind the camera."""
+    step = target.models.predict(target.bank, head.t - target.head.t)
+    belief = imm.combined(step.filtered)
+    place = head.inside(belief.mean[P])
+    sigma = float(np.sqrt(head.R[:, 2] @ belief.cov[P, P] @ head.R[:, 2]))
+    return Expected(step, quads_at(target, place), float(place[2]), sigma / max(float(place[2]), NEAREST))
 
 
-def _expected_quads(target: Target) -> dict[str, Array] | None:
-    """Where the target is expected in both views; None behind the camera."""
-    place = target.head.inside(target.belief.mean[P])
-    if place[2] < 0.2:
-        return None
+def quads_at(target: Target, place: Array) -> dict[str, Array]:
+    """The quads (4, 2) px by view of the target at a place (3,) m of the camera's frame; none behind it."""
+    if place[2] < NEAREST:
+        return {}
     across, down = np.array([target.size[0] / 2, 0, 0]), np.array([0, target.size[1] / 2, 0])
     corners = place + np.stack([-across - down, across - down, across + down, -across + down])
     right = projected(target.rig.right.K, in_right(target.rig, corners))
     return {"left": projected(target.rig.left.K, corners), "right": right}
 
 
-def _look(target: Target, views: dict[str, list[Grey]], quads: dict[str, Array]) -> tuple[Array, Array, Array] | None:
-    """Left and right quads (4, 2) where the target is seen, and the noise (4, 4) of both middles; or None."""
-    size = views["left"][0].shape[1], views["left"][0].shape[0]
-    left = quads["left"]
-    good = target.config.measure.good
-    found = patches.align(views["left"], left, target.sought, 0.2) if patches.inside(left, size, 0) else None
+def follow(target: Target, pair: Pair, expected: Expected, hidden: bool) -> None:
+    """One frame further: look where it is expected, unless it is hidden by something, and update."""
+    before, head, step = target.head, pair.head, expected.step
+    target.away += float(np.linalg.norm(head.T - before.T))
+    target.bank, target.head = step.filtered, head
+    quads = expected.quads
+    found = _look(target, pair, expected) if quads and not hidden else None
+    nis, measured = 0.0, False
+    if found is not None:
+        left, right, R, alignment = found
+        z, R = _measurement(target, left, right, R, pair.flow)
+        updated = _updated(target, step, z, R, head, before)
+        if updated is not None:
+            step, nis = updated
+            target.bank = step.filtered
+            measured, quads = True, {"left": left, "right": right}
+            target.last_seen = head.t
+            _refresh(target, pair, left, alignment)
+    boxes = {view: box_of(quad) for view, quad in quads.items()}
+    later = None
+    if target.config.latency > 0:
+        later = imm.combined(target.models.predict(target.bank, target.config.latency).filtered)
+    target.history.append(Seen(pair.frame, head.t, head, boxes, measured, step, nis, later))
+
+
+def alike(target: Target, pair: Pair, quad: Array) -> bool:
+    """Whether what a left quad (4, 2) shows looks as the target did."""
+    return unlike(target.looks, looks(pair.pictures["left"], quad)) < ALIKE
+
+
+def found_again(target: Target, pair: Pair, middle: Array, depth: float) -> Array | None:
+    """The left quad (4, 2) of a target that was lost, around a pixel (2,) at a depth (m); None where it is not it."""
+    focal = np.diag(target.rig.left.K)[:2]
+    half = target.size * focal / depth / 2
+    quad = middle + half * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1.0]])
+    moved = patches.searched(pair.levels[0], quad, target.sought, SEARCH, target.config.measure.good)
+    if moved is None or not patches.inside(moved, pair.size, 0) or not alike(target, pair, moved):
+        return None
+    return moved
+
+
+def _across(rig: StereoRig, pair: Pair, left: Array, right: Array, reach: float) -> tuple[Array, Array] | None:
+    """The right quad (4, 2) of a left one, near `right` on the epipolar line, and the variances (2,) of its place."""
+    ray = np.append(left.mean(axis=0), 1.0) @ np.linalg.inv(rig.left.K).T
+    far, near = projected(rig.right.K, in_right(rig, ray * np.array([[200.0], [100.0]])))
+    along = near - far
+    if not np.isfinite(along).all() or np.linalg.norm(along) < 1e-9:
+        return None
+    return region_shift(pair.pictures, left, right, along / np.linalg.norm(along), reach)
+
+
+def _look(target: Target, pair: Pair, expected: Expected) -> tuple[Array, Array, Array, Alignment] | None:
+    """Left and right quads (4, 2) where the target is seen, the noise (4, 4) of both middles, and the fit; or None."""
+    left, good = expected.quads["left"], target.config.measure.good
+    found = patches.align(pair.levels, left, target.sought, STRETCH) if patches.inside(left, pair.size, 0) else None
     if found is None or found.correlation < good:
-        moved = patches.searched(views["left"][0], left, target.sought, SEARCH, good)
-        if moved is None or not patches.inside(moved, size, 0):
+        moved = patches.searched(pair.levels[0], left, target.sought, SEARCH, good)
+        if moved is None or not patches.inside(moved, pair.size, 0):
             return None
         left = moved
-        found = patches.align(views["left"], left, target.sought, 0.2)
+        found = patches.align(pair.levels, left, target.sought, STRETCH)
         if found is None or found.correlation < good:
             return None
-    left = found.quad(left)
-    shift = region_shift(views, left, (quads["right"] - quads["left"]).mean(axis=0), good)
-    if shift is None:
+    moved = found.quad(left)
+    if pair.head.t - target.last_seen > COASTED_S and not alike(target, pair, moved):
+        return None
+    right = expected.quads["right"] + (moved - expected.quads["left"])
+    disparity = abs(float(np.mean(moved[:, 0] - right[:, 0])))
+    across = _across(target.rig, pair, moved, right, REACH + 3 * min(expected.doubt, 0.1) * disparity)
+    if across is None:
         return None
     R = np.zeros((4, 4))
     R[:2, :2] = TRUST * found.cov[:2, :2]
-    R[2:, 2:] = np.diag(shift[1])
-    return left, left + shift[0], R
+    R[2:, 2:] = np.diag(across[1])
+    return moved, across[0], R, found
 
 
-def _measurement(
-    target: Target, left: Array, right: Array, noise: Array, flow: Array | None, dt: float
-) -> tuple[Array, Array]:
+def _measurement(target: Target, left: Array, right: Array, noise: Array, flow: Array | None) -> tuple[Array, Array]:
     """z (5,): flow (2,) px a frame, disparity, middle (2,) px; and its noise (5, 5). Jia 2008, eq. 17."""
     settings = target.config.measure
     u, v = left.mean(axis=0)
@@ -232,17 +301,17 @@ def _updated(target: Target, step: Step, z: Array, R: Array, head: Head, before:
     return updated, float(np.exp(updated.filtered.log_mu) @ innovation.nis)
 
 
-def _refresh(target: Target, views: dict[str, list[Grey]], left: Array, head: Head) -> None:
-    """Take the template anew where the target has turned, and let its size follow slowly."""
-    place = head.inside(target.belief.mean[P])
+def _refresh(target: Target, pair: Pair, left: Array, found: Alignment) -> None:
+    """Take the template anew where the target has turned, and let its size and looks follow slowly."""
+    place = pair.head.inside(target.belief.mean[P])
     size = np.array(patches.side(left)) * place[2] / np.diag(target.rig.left.K)[:2]
     target.size = target.size + 0.1 * (np.clip(size, 0.8 * target.size, 1.25 * target.size) - target.size)
-    found = patches.align(views["left"], left, target.sought, 0.05)
-    if found is None or found.correlation < target.config.measure.fresh:
-        target.sought = patches.template(views["left"], left)
+    target.looks = KEEP_LOOKS * target.looks + (1 - KEEP_LOOKS) * looks(pair.pictures["left"], left)
+    if found.correlation < target.config.measure.fresh:
+        target.sought = patches.holding(pair.levels, left)
 
 
-def _box(quad: Array) -> Array:
+def box_of(quad: Array) -> Array:
     """[x, y, w, h] around a quad (4, 2)."""
     low, top = quad.min(axis=0), quad.max(axis=0)
     return np.concatenate([low, top - low])

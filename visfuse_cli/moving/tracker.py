@@ -8,16 +8,16 @@ from contextlib import AbstractContextManager
 import numpy as np
 
 from visfuse_cli.moving import target as one
-from visfuse_cli.moving.find import Finder
+from visfuse_cli.moving.find import Finder, Found
 from visfuse_cli.moving.models import Models
 from visfuse_cli.moving.settings import FlowSettings, ImmConfig
-from visfuse_cli.moving.target import Head, Target
-from visfuse_cli.records import Array, GivenTarget, Image, StereoRig
+from visfuse_cli.moving.target import Head, Pair, Target
+from visfuse_cli.records import Array, Gaussian, GivenTarget, Image, StereoRig
 from visfuse_cli.vision import flow as optical
 from visfuse_cli.vision import patches
 from visfuse_cli.vision.epipolar_match import match
-from visfuse_cli.vision.patches import Grey
 
+HIDDEN = 0.35  # share of a target's box that one before it covers: then it is not looked for
 SMALL_LINES = 480  # up to which Horn-Schunck is the default
 Stage = Callable[[str], AbstractContextManager[None]]
 
@@ -33,82 +33,105 @@ class Tracker:
         self._finder = None if given else Finder(rig, config, size)
         self._waiting = sorted(enumerate(given, start=1), key=lambda pair: pair[1].frame)
         self._followed: list[Target] = []
+        self._gone: list[Target] = []  # but remembered: they may come back
         self._next_id = 1
-        self._before: tuple[Head, Image, Array | None] | None = None  # head, grey picture, depth
+        self._before: tuple[Head, Image] | None = None
         self.missed: list[str] = []  # what was to be begun and could not be
 
     def step(self, pictures: Mapping[str, Image], frame: int, head: Head) -> list[Target]:
-        """One pair further; returns those that nobody follows any more."""
+        """One pair further; returns those that nobody follows or waits for any more."""
         with self._stage("pyramids"):
-            views = {name: patches.pyramid(picture) for name, picture in pictures.items()}
-            grey = np.asarray(views["left"][0], np.uint8)
+            levels = patches.pyramid(pictures["left"])
+            grey = np.asarray(levels[0], np.uint8)
         with self._stage("flow"):
             flow = dense_flow(self._before[1], grey, self._config.flow) if self._before is not None else None
+        pair = Pair(frame, head, pictures, levels, flow)
         with self._stage("filter"):
-            for each in self._followed:
-                one.follow(each, views, flow, frame, head)
-        ended = [each for each in self._followed if self._over(each, head.t)]
-        self._followed = [each for each in self._followed if each not in ended]
-        self._begin_given(views, frame, head)
-        depth = self._newcomers(pictures["left"], views, grey, flow, frame, head) if self._finder is not None else None
-        self._before = (head, grey, depth)
-        return ended
+            self._follow(pair)
+        self._gone += [each for each in self._followed if self._over(each, head.t)]
+        self._followed = [each for each in self._followed if not each.ended_by]
+        self._begin_given(pair)
+        if self._finder is not None:
+            with self._stage("newcomers"):
+                boxes = [each.history[-1].boxes["left"] for each in self._followed if each.history[-1].boxes]
+                found = self._finder.look(pair, grey, boxes)
+            self._begin_found(found, pair)
+        self._before = (head, grey)
+        over = [each for each in self._gone if head.t - each.last_seen > self._config.life.memory_s]
+        self._gone = [each for each in self._gone if each not in over]
+        return over
 
     def finish(self) -> list[Target]:
-        """Those that were followed to the end."""
+        """Those that were followed to the end, or waited for."""
         for each in self._followed:
             each.ended_by = "end of footage"
         self.missed += [
             f"target {identity} of init.yaml begins at frame {given.frame}, which the footage does not have"
             for identity, given in self._waiting
         ]
-        return self._followed
+        return self._gone + self._followed
 
-    def _begin_given(self, views: dict[str, list[Grey]], frame: int, head: Head) -> None:
-        while self._waiting and self._waiting[0][1].frame <= frame:
+    def _follow(self, pair: Pair) -> None:
+        """Follow everyone, the nearest first: what stands behind one of them is hidden, and not looked for."""
+        expected = [(one.expect(each, pair.head), each) for each in self._followed]
+        taken: list[Array] = []  # boxes
+        for where, target in sorted(expected, key=lambda pair: pair[0].depth):
+            own = one.box_of(where.quads["left"]) if where.quads else None
+            hidden = own is not None and any(covered(own, box) > HIDDEN for box in taken)
+            one.follow(target, pair, where, hidden)
+            if target.history[-1].boxes and (target.history[-1].measured or not hidden):
+                taken.append(target.history[-1].boxes["left"])
+
+    def _begin_given(self, pair: Pair) -> None:
+        while self._waiting and self._waiting[0][1].frame <= pair.frame:
             identity, given = self._waiting.pop(0)
-            right = (
-                match(self._rig, views, given.left, self._config.measure.good) if given.right is None else given.right
-            )
-            new = None if right is None else self._started(identity, views, (given.left, right), frame, head, given)
+            right = self._match(pair, given.left) if given.right is None else given.right
+            deviation = max(self._config.filter.start_speed, abs(given.speed or 0.0))
+            velocity = Gaussian(np.zeros(3), deviation**2 * np.eye(3))
+            new = None if right is None else self._started(identity, pair, given.left, right, velocity, True)
             if new is None:
-                self.missed.append(f"target {identity} of init.yaml was not found in the right view at frame {frame}")
+                self.missed.append(
+                    f"target {identity} of init.yaml was not found in the right view at frame {pair.frame}"
+                )
             else:
                 self._followed.append(new)
 
-    def _newcomers(
-        self, picture: Image, views: dict[str, list[Grey]], grey: Image, flow: Array | None, frame: int, head: Head
-    ) -> Array:
-        """Begin what moves by itself and is not followed yet; returns the depth (H, W) m of the left view."""
-        assert self._finder is not None
-        with self._stage("depth"):
-            depth = self._finder.depth(grey, np.asarray(views["right"][0], np.uint8))
-        if self._before is None or self._before[2] is None or flow is None:
-            return depth
-        with self._stage("newcomers"):
-            boxes = [each.history[-1].boxes for each in self._followed]
-            known = [each["left"] for each in boxes if "left" in each]
-            found = self._finder.look(picture, self._before[2], flow, self._before[0], head, known)
-        for quad, velocity in found:
-            right = match(self._rig, views, quad, self._config.measure.good)
-            new = None if right is None else self._started(self._next_id, views, (quad, right), frame, head, velocity)
-            if new is not None:
-                self._followed.append(new)
+    def _begin_found(self, found: Sequence[Found], pair: Pair) -> None:
+        """Begin what moves by itself and is not followed yet, or go on with who was lost or away."""
+        for each in found:
+            velocity = Gaussian(each.velocity, self._config.filter.start_speed**2 * np.eye(3))
+            old, quad = self._known(each, pair)
+            right = self._match(pair, quad)
+            identity = self._next_id if old is None else old.id
+            new = None if right is None else self._started(identity, pair, quad, right, velocity, False)
+            if new is None:
+                continue
+            if old is None:
                 self._next_id += 1
-        return depth
+            else:
+                new.earlier, new.size, new.looks = old, old.size, old.looks
+                for group in (self._gone, self._followed):
+                    group[:] = [other for other in group if other is not old]
+            self._followed.append(new)
+
+    def _known(self, found: Found, pair: Pair) -> tuple[Target | None, Array]:
+        """Who of those that are lost or away was found, and where (4, 2) px; else nobody, and the quad as it is."""
+        lost = [each for each in self._followed if pair.head.t - each.last_seen > one.COASTED_S]
+        for old in sorted([*lost, *self._gone], key=lambda each: -each.last_seen):
+            quad = one.found_again(old, pair, found.quad.mean(axis=0), found.depth)
+            if quad is not None:
+                return old, quad
+        return None, found.quad
+
+    def _match(self, pair: Pair, quad: Array) -> Array | None:
+        """The right quad (4, 2) of a left one, over all depths."""
+        views = {"left": pair.levels, "right": patches.pyramid(pair.pictures["right"])}
+        return match(self._rig, views, quad, self._config.measure.good)
 
     def _started(
-        self,
-        identity: int,
-        views: dict[str, list[Grey]],
-        quads: tuple[Array, Array],
-        frame: int,
-        head: Head,
-        known: GivenTarget | Array,
+        self, identity: int, pair: Pair, left: Array, right: Array, velocity: Gaussian, given: bool
     ) -> Target | None:
-        given = isinstance(known, GivenTarget)
-        velocity = np.zeros(3) if isinstance(known, GivenTarget) else known
-        return one.start(identity, self._rig, self._config, self._models, views, *quads, frame, head, velocity, given)
+        return one.start(identity, self._rig, self._config, self._models, pair, left, right, velocity, given)
 
     def _over(self, target: Target, t: float) -> bool:
         """Whether a track ends here, and why."""
@@ -118,6 +141,12 @@ class Tracker:
         elif box is None or np.any(box[:2] + box[2:] / 2 < 0) or np.any(box[:2] + box[2:] / 2 > self._size):
             target.ended_by = "left"
         return bool(target.ended_by)
+
+
+def covered(box: Array, other: Array) -> float:
+    """The share of a box [x, y, w, h] that another one covers."""
+    low, top = np.maximum(box[:2], other[:2]), np.minimum(box[:2] + box[2:], other[:2] + other[2:])
+    return float(np.prod(np.clip(top - low, 0, None)) / max(float(np.prod(box[2:])), 1e-9))
 
 
 def dense_flow(before: Image, after: Image, settings: FlowSettings) -> Array:

@@ -18,6 +18,8 @@ ROUNDS = 20
 FEWEST, MOST = 10, 72  # samples along a side of a patch that is aligned
 HUBER = 2.5
 LONGEST = 30000  # rows of a picture that remap makes
+PLAIN = 4.0  # grey levels: differences of neighbouring samples of a patch without edges are smaller
+AROUND, AROUND_PX = 0.12, 3.0  # of its side, and px: how far its template then reaches beyond it
 RIM_PX = 0.5  # px inside of a quad at which its patch begins: beyond its edge lies something else
 
 
@@ -91,6 +93,18 @@ def template(levels: list[Grey], quad: Array) -> Template:
     return Template(unit, sampled(levels, warped(quad, unit), _spacing(quad, count)).astype(float))
 
 
+def holding(levels: list[Grey], quad: Array) -> Template:
+    """The patch in a quad (4, 2), and what lies around it where a plain inside has no edges to hold on to."""
+    inside = template(levels, quad)
+    values = inside.values.reshape(_count(inside.unit)[::-1])
+    edges = [float(np.sqrt(np.mean(np.diff(values, axis=axis) ** 2))) for axis in (1, 0)]
+    if min(edges) >= PLAIN:
+        return inside
+    more = np.where(np.array(edges) < PLAIN, np.maximum(AROUND, AROUND_PX / np.array(side(quad))), 0.0)
+    unit = -more + (1 + 2 * more) * grid(_count(inside.unit))
+    return Template(unit, sampled(levels, warped(quad, unit), _spacing(quad, _count(unit))).astype(float))
+
+
 def _spacing(quad: Array, count: tuple[int, int]) -> float:
     wide, high = side(quad)
     return float(np.sqrt(wide / count[0] * high / count[1]))
@@ -129,7 +143,7 @@ def align(levels: list[Grey], quad: Array, sought: Template, stretch_sigma: floa
     p = np.zeros(4)
     reach = max(3.0, 0.25 * min(side(quad)))
     A, weight, left = np.zeros((4, 4)), np.ones(len(points)), np.zeros(len(points))
-    correlation, h = 0.0, max(0.5, spacing / 2)
+    now, h = sought.values, max(0.5, spacing / 2)
     gain, noise2 = 1.0, 1.0
     for _ in range(ROUNDS):
         away = points - middle
@@ -162,11 +176,11 @@ def align(levels: list[Grey], quad: Array, sought: Template, stretch_sigma: floa
         p = p + np.clip(step, -2 * spacing, 2 * spacing) * [1, 1, 0.5, 0.5]
         if np.linalg.norm(p[:2]) > reach or np.any(np.abs(p[2:]) > 0.5):
             return None
-        correlation = float(np.corrcoef(now, sought.values)[0, 1])
         A = gain**2 * (W[:, :4].T @ X[:, :4])
         if np.linalg.norm(step[:2]) < 0.002 and np.abs(step[2:]).max() < 2e-5:
             break
     sigma2 = float(np.sum(weight * left**2) / max(np.sum(weight) - 6, 1))
+    correlation = float(np.corrcoef(now, sought.values)[0, 1])
     return Alignment(p[:2], p[2:], np.asarray(np.linalg.pinv(A), dtype=float) * sigma2, correlation)
 
 
@@ -180,9 +194,11 @@ def searched(level: Grey, quad: Array, sought: Template, reach: float, good: flo
     away = reach * np.array([wide, high])
     low = np.maximum(np.floor(quad.min(axis=0) - away), 0).astype(int)
     top = np.minimum(np.ceil(quad.max(axis=0) + away), [level.shape[1], level.shape[0]]).astype(int)
+    picture = sought.values.reshape(_count(sought.unit)[::-1]).astype(np.float32)
+    share = np.clip(np.ptp(sought.unit, axis=0) + 1 / np.array(_count(sought.unit)), 1.0, None)  # it may reach beyond
+    count = (int(count[0] * share[0]), int(count[1] * share[1]))
     if np.any(top - low < np.array(count) + 2):
         return None
-    picture = sought.values.reshape(_count(sought.unit)[::-1]).astype(np.float32)
     wanted = cv2.resize(picture, count, interpolation=cv2.INTER_AREA)
     window = np.ascontiguousarray(level[low[1] : top[1], low[0] : top[0]])
     _, best, _, at = cv2.minMaxLoc(cv2.matchTemplate(window, wanted, cv2.TM_CCOEFF_NORMED))

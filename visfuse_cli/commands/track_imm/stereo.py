@@ -136,7 +136,7 @@ class StereoRun:
 
     def _settled(self, target: Target) -> dict[str, Any] | None:
         at = {frame: k for k, frame in enumerate(self._frames)}
-        path = conclude(target, np.stack([self._covs[at[seen.frame]] for seen in target.history]))
+        path = conclude(target, lambda frame: self._covs[at[frame]])
         return None if path is None else track_record(path, self._config.latency)
 
 
