@@ -15,12 +15,11 @@ from visfuse_cli.maths.imm import Bank, Step
 from visfuse_cli.moving.settings import ImmConfig
 from visfuse_cli.records import Array, Gaussian
 from visfuse_cli.vision import patches
-from visfuse_cli.vision.patches import Alignment, Grey, Template
+from visfuse_cli.vision.patches import Template
 
 YOUNG = 6  # measurements from which the first place and velocity are estimated
 GATE = 1 - 1e-6
 TRUST = 4.0  # times an alignment's own covariance
-SEARCH = 0.8  # of its size: how far around the prediction a lost target is looked for
 STRETCH = 0.05  # by which a target's picture may be off the size that its distance gives it
 START_DOUBT = 9.0  # times the covariance of the first place and velocity: the same frames are filtered again
 
@@ -96,11 +95,11 @@ def follow(target: Target, view: View) -> None:
     step = target.models.predict(target.steps[-1].filtered, dt) if target.steps else None
     place = combined(step.filtered).mean[:2] if step is not None else target.place
     quad = target.quad_at(place, view.gaze)
-    found = _look(target, view.levels, quad)
+    found = patches.follow(view.levels, quad, target.sought, STRETCH, target.config.measure.good)
     z, R = None, np.zeros((4, 4))
     if found is not None:
-        seen, alignment = found
-        z, R = _measured(target, target.anchor(seen), TRUST * alignment.cov[:2, :2], view.gaze, dt)
+        seen = found.quad(quad)
+        z, R = _measured(target, target.anchor(seen), TRUST * found.cov[:2, :2], view.gaze, dt)
         quad = seen if z is not None else quad
     if step is not None:
         updated = _updated(step, z, R) if z is not None else None
@@ -114,28 +113,10 @@ def follow(target: Target, view: View) -> None:
     target.looks.append(Look(view.frame, view.t, view.gaze, _box(quad), z, R))
     if z is not None and found is not None:
         target.place, target.last_seen = z[:2], view.t
-        if found[1].correlation < target.config.measure.fresh:
+        if found.correlation < target.config.measure.fresh:
             target.sought = patches.holding(view.levels, quad)
     if not target.steps and sum(look.z is not None for look in target.looks) >= YOUNG:
         _begin(target)
-
-
-def _look(target: Target, levels: list[Grey], quad: Array) -> tuple[Array, Alignment] | None:
-    """The quad (4, 2) where the target is seen, near the one that is expected, and how well it fits there."""
-    size = levels[0].shape[1], levels[0].shape[0]
-    good = target.config.measure.good
-    if not patches.inside(quad, size, 0):
-        return None
-    found = patches.align(levels, quad, target.sought, STRETCH)
-    if found is None or found.correlation < good:
-        moved = patches.searched(levels[0], quad, target.sought, SEARCH, good)
-        if moved is None or not patches.inside(moved, size, 0):
-            return None
-        quad = moved
-        found = patches.align(levels, quad, target.sought, STRETCH)
-        if found is None or found.correlation < good:
-            return None
-    return found.quad(quad), found
 
 
 def _measured(target: Target, at: Array, cov: Array, gaze: Array, dt: float | None) -> tuple[Array | None, Array]:

@@ -197,8 +197,8 @@ def _run(share: Array, middle: float) -> tuple[int, int]:
     """
     full = share >= 0.5 * max(float(share.max(initial=0.0)), 1e-9)
     gap = np.ones(len(full) // 3 + 1, np.uint8)
-    full = np.pad(full, len(full)).astype(np.uint8)[None]
-    full = cv2.morphologyEx(full, cv2.MORPH_CLOSE, gap[None])[0, len(share) : 2 * len(share)] > 0
+    wide = np.pad(full, len(full)).astype(np.uint8)[None]
+    full = np.asarray(cv2.morphologyEx(wide, cv2.MORPH_CLOSE, gap[None])[0, len(share) : 2 * len(share)] > 0)
     at = int(np.clip(round(middle), 0, len(full) - 1))
     before, after = np.flatnonzero(~full[:at]), np.flatnonzero(~full[at:])
     return int(before[-1]) + 1 if len(before) else 0, at + (int(after[0]) if len(after) else len(full) - at)

@@ -21,11 +21,12 @@ from visfuse_cli.vision.patches import Alignment, Grey, Template
 
 STEP = 1e-3  # m, m/s: of the numerical Jacobian
 GATE = 1 - 1e-7
-SEARCH = 0.8  # of its size: how far around the prediction a lost target is looked for
 STRETCH = 0.2  # by which a target's picture may be off the size that its distance gives it
 TRUST = 4.0  # times an alignment's own covariance
 NEAREST = 0.2  # m before the camera
 REACH = 3.0  # px of disparity around the expected one, at least
+HIDDEN = 0.2  # share of a target's box that others cover: from there on it is not looked for
+FLOW_RIM = 4.0  # px from the edge of the picture, within which there is no saying what its flow is
 COASTED_S = 0.25  # after which a target that is found again must look as it did
 ALIKE = 45.0  # grey levels: looks that differ by less may be of one thing
 KEEP_LOOKS = 0.95  # of what a target looked like, from frame to frame
@@ -169,16 +170,17 @@ def quads_at(target: Target, place: Array) -> dict[str, Array]:
     return {"left": projected(target.rig.left.K, corners), "right": right}
 
 
-def follow(target: Target, pair: Pair, expected: Expected, hidden: bool) -> None:
-    """One frame further: look where it is expected, unless it is hidden by something, and update."""
+def follow(target: Target, pair: Pair, expected: Expected, hidden: float) -> None:
+    """One frame further: look where it is expected, unless too large a share of it is hidden by others, and update."""
     before, head, step = target.head, pair.head, expected.step
     target.away += float(np.linalg.norm(head.T - before.T))
     target.bank, target.head = step.filtered, head
     quads = expected.quads
-    found = _look(target, pair, expected) if quads and not hidden else None
+    found = _look(target, pair, expected) if quads and hidden < HIDDEN else None
     nis, measured = 0.0, False
     if found is not None:
         left, right, R, alignment = found
+        R[0, 0] += (hidden * patches.side(left)[0]) ** 2  # what is left to be seen lies to one side
         z, R = _measurement(target, left, right, R, pair.flow)
         updated = _updated(target, step, z, R, head, before)
         if updated is not None:
@@ -204,7 +206,7 @@ def found_again(target: Target, pair: Pair, middle: Array, depth: float) -> Arra
     focal = np.diag(target.rig.left.K)[:2]
     half = target.size * focal / depth / 2
     quad = middle + half * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1.0]])
-    moved = patches.searched(pair.levels[0], quad, target.sought, SEARCH, target.config.measure.good)
+    moved = patches.searched(pair.levels[0], quad, target.sought, patches.SEARCH, target.config.measure.good)
     if moved is None or not patches.inside(moved, pair.size, 0) or not alike(target, pair, moved):
         return None
     return moved
@@ -222,16 +224,10 @@ def _across(rig: StereoRig, pair: Pair, left: Array, right: Array, reach: float)
 
 def _look(target: Target, pair: Pair, expected: Expected) -> tuple[Array, Array, Array, Alignment] | None:
     """Left and right quads (4, 2) where the target is seen, the noise (4, 4) of both middles, and the fit; or None."""
-    left, good = expected.quads["left"], target.config.measure.good
-    found = patches.align(pair.levels, left, target.sought, STRETCH) if patches.inside(left, pair.size, 0) else None
-    if found is None or found.correlation < good:
-        moved = patches.searched(pair.levels[0], left, target.sought, SEARCH, good)
-        if moved is None or not patches.inside(moved, pair.size, 0):
-            return None
-        left = moved
-        found = patches.align(pair.levels, left, target.sought, STRETCH)
-        if found is None or found.correlation < good:
-            return None
+    left = expected.quads["left"]
+    found = patches.follow(pair.levels, left, target.sought, STRETCH, target.config.measure.good)
+    if found is None:
+        return None
     moved = found.quad(left)
     if pair.head.t - target.last_seen > COASTED_S and not alike(target, pair, moved):
         return None
@@ -254,7 +250,7 @@ def _measurement(target: Target, left: Array, right: Array, noise: Array, flow: 
     R = np.zeros((5, 5))
     R[2, 2] = noise[2, 2] + settings.disparity_sigma**2
     R[3:, 3:] = noise[:2, :2] + settings.place_sigma**2 * np.eye(2)
-    mean = None if flow is None else _mean_flow(left, flow)
+    mean = None if flow is None else _mean_flow(left, flow)  # what runs out of the picture has no flow
     if mean is None:
         R[:2, :2] = 1e6 * np.eye(2)
     else:
@@ -264,7 +260,9 @@ def _measurement(target: Target, left: Array, right: Array, noise: Array, flow: 
 
 
 def _mean_flow(quad: Array, flow: Array) -> Array | None:
-    """The median flow (2,) px inside the inner half of a quad; None where it leaves the picture."""
+    """The median flow (2,) px inside the inner half of a quad; None at the picture's edge."""
+    if not patches.inside(quad, (flow.shape[1], flow.shape[0]), FLOW_RIM):
+        return None
     middle, half = quad.mean(axis=0), np.array(patches.side(quad)) / 4
     low, top = np.maximum(np.rint(middle - half), 0).astype(int), np.rint(middle + half).astype(int) + 1
     part = flow[low[1] : top[1], low[0] : top[0]].reshape(-1, 2)

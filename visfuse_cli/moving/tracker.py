@@ -17,7 +17,6 @@ from visfuse_cli.vision import flow as optical
 from visfuse_cli.vision import patches
 from visfuse_cli.vision.epipolar_match import match
 
-HIDDEN = 0.35  # share of a target's box that one before it covers: then it is not looked for
 SMALL_LINES = 480  # up to which Horn-Schunck is the default
 Stage = Callable[[str], AbstractContextManager[None]]
 
@@ -77,9 +76,9 @@ class Tracker:
         taken: list[Array] = []  # boxes
         for where, target in sorted(expected, key=lambda pair: pair[0].depth):
             own = one.box_of(where.quads["left"]) if where.quads else None
-            hidden = own is not None and any(covered(own, box) > HIDDEN for box in taken)
+            hidden = max((covered(own, box) for box in taken), default=0.0) if own is not None else 0.0
             one.follow(target, pair, where, hidden)
-            if target.history[-1].boxes and (target.history[-1].measured or not hidden):
+            if target.history[-1].boxes and (target.history[-1].measured or hidden < one.HIDDEN):
                 taken.append(target.history[-1].boxes["left"])
 
     def _begin_given(self, pair: Pair) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -18,6 +18,8 @@ ROUNDS = 20
 FEWEST, MOST = 10, 72  # samples along a side of a patch that is aligned
 HUBER = 2.5
 LONGEST = 30000  # rows of a picture that remap makes
+VISIBLE = 0.6  # share of a patch that must be in the picture
+SEARCH = 0.8  # of its size: how far around the prediction a lost target is looked for
 PLAIN = 4.0  # grey levels: differences of neighbouring samples of a patch without edges are smaller
 AROUND, AROUND_PX = 0.12, 3.0  # of its side, and px: how far its template then reaches beyond it
 RIM_PX = 0.5  # px inside of a quad at which its patch begins: beyond its edge lies something else
@@ -103,6 +105,39 @@ def holding(levels: list[Grey], quad: Array) -> Template:
     more = np.where(np.array(edges) < PLAIN, np.maximum(AROUND, AROUND_PX / np.array(side(quad))), 0.0)
     unit = -more + (1 + 2 * more) * grid(_count(inside.unit))
     return Template(unit, sampled(levels, warped(quad, unit), _spacing(quad, _count(unit))).astype(float))
+
+
+def visible(sought: Template, quad: Array, size: tuple[int, int]) -> Template | None:
+    """What of a template in a quad (4, 2) lies in a picture of that size; None where less than VISIBLE of it does."""
+    if not np.isfinite(quad).all():
+        return None
+    at = warped(quad, sought.unit)
+    shape = _count(sought.unit)[::-1]
+    there = np.all((at > 0) & (at < np.array(size) - 1), axis=-1).reshape(shape)
+    kept = np.outer(there.any(axis=1), there.any(axis=0)).ravel()
+    if np.count_nonzero(kept) < VISIBLE * len(kept):
+        return None
+    return Template(sought.unit[kept], sought.values[kept])
+
+
+def follow(levels: list[Grey], quad: Array, sought: Template, stretch: float, good: float) -> Alignment | None:
+    """Find a template near a quad (4, 2), or around it where it is lost; None where it is not, or mostly out of view.
+
+    The shift is from the quad that was given.
+    """
+    size = levels[0].shape[1], levels[0].shape[0]
+    part = visible(sought, quad, size)
+    if part is None:
+        return None
+    whole = len(part.values) == len(sought.values)
+    found = align(levels, quad, part, stretch if whole else stretch / 10)  # a part tells little of the size
+    if found is not None and found.correlation >= good and visible(sought, found.quad(quad), size) is not None:
+        return found
+    moved = searched(levels[0], quad, sought, SEARCH, good) if whole else None
+    found = None if moved is None else align(levels, moved, sought, stretch)
+    if moved is None or found is None or found.correlation < good:
+        return None
+    return replace(found, shift=found.shift + (moved - quad).mean(axis=0))
 
 
 def _spacing(quad: Array, count: tuple[int, int]) -> float:
