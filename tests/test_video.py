@@ -92,6 +92,12 @@ def test_variable_rate_start_offset_and_ntsc_stamps_are_exact(tmp_path):
     assert audit.nominal_interval_s == pytest.approx(1001 / 30000)
 
 
+def test_a_matroska_clip_that_starts_late_has_lost_nothing(tmp_path):
+    _, frames, audit = read(write_clip(tmp_path / "late.mkv", [2000 + 40 * k for k in range(30)], tick=MS))
+    assert len(frames) == 30
+    assert (audit.lost, audit.dropped, audit.warnings) == (0, 0, ())
+
+
 def test_audit_counts_dropped_and_repeated_frames(tmp_path):
     kept = [k for k in range(40) if k not in (7, 20, 21)]
     images = pictures(len(kept))

@@ -103,6 +103,7 @@ class _Results:
     began: dict[str, datetime | None] = field(default_factory=dict)
     doubts: list[str] = field(default_factory=list)  # about times of day
     watches: dict[str, CameraWatch] = field(default_factory=dict)
+    suns: dict[str, dict[str, Any] | None] = field(default_factory=dict)
     strangers: dict[str, Strangers] = field(default_factory=dict)
 
 
@@ -182,6 +183,7 @@ def run(request: RunRequest) -> RunResult:
                 "began_utc": {name: _utc(moment, 0.0) or None for name, moment in results.began.items()},
                 "camera": {name: watch.report() for name, watch in results.watches.items()},
                 "crs": None if ground.reference is None else asdict(ground.reference),
+                "sun": results.suns,
                 "lanes": lanes,
                 "annotated_by": "a second decode of the footage" if request.video else None,
             },
@@ -246,10 +248,10 @@ def _track(clip: _Clip, run_: Run, spool: TrackSpool, results: _Results, first_i
             frame = watch.steadied(shown)
         if frame is None:
             continue
+        tracker.predict(frame.t)
         with run_.stage("detect"):
-            evidence = look.evidence(frame)
+            evidence = look.evidence(frame, tracker.expected())
         with run_.stage("track"):
-            tracker.predict(frame.t)
             ended = tracker.update(frame.index, evidence)
             if clip.config.privacy.blur:
                 strangers.add(frame.index, tracker.unexplained)
@@ -257,8 +259,9 @@ def _track(clip: _Clip, run_: Run, spool: TrackSpool, results: _Results, first_i
         with run_.stage("conclude"):
             _settle(*ended, clip, tracker, lamps, run_, spool, results, label)
         with run_.stage("learn"):
-            look.learn(frame, tracker.outlines())
+            look.learn(frame, tracker)
     _settle(*tracker.finish(), clip, tracker, lamps, run_, spool, results, label)
+    results.suns[clip.name] = look.report()
     audit = results.audits[clip.name] = clip.source.audit()
     for warning in (*audit.warnings, *watch.warnings(clip.name)):
         run_.warn(warning)

@@ -206,7 +206,9 @@ def _announced_end(container: Any, stream: av.VideoStream) -> float | None:
     if stream.duration and stream.time_base:
         return float(stream.duration * stream.time_base)
     if container.duration and len(container.streams) == 1:
-        return float(container.duration) / av.time_base
+        # Matroska's length is the last stamp and not the time since the first one.
+        before = max(container.start_time or 0, 0) if "matroska" in container.format.name else 0
+        return float(container.duration - before) / av.time_base
     return None
 
 

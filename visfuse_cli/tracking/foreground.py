@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal, Protocol
+from typing import Any, Literal, Protocol
 
 import cv2
 import numpy as np
@@ -11,12 +11,16 @@ from pydantic import Field
 from visfuse_cli.config import Section
 from visfuse_cli.maths.homography import apply
 from visfuse_cli.records import Array, Frame, GroundCamera, Image
-from visfuse_cli.tracking.evidence import BoxEvidence, Evidence, LabelEvidence
+from visfuse_cli.tracking.evidence import Boxes, BoxEvidence, Evidence, LabelEvidence
+from visfuse_cli.tracking.ground import GroundTracker
+from visfuse_cli.tracking.sun import Shade, Sun, shadow_picture
 from visfuse_cli.tracking.zones import Region
 from visfuse_cli.vision import regions as region_tools
 from visfuse_cli.vision.background import Background
 from visfuse_cli.vision.lens import distort_points
 from visfuse_cli.vision.steady import moved
+
+SETTLED = 12  # frames after which a track's size is known well enough to tell its shadow
 
 
 class BackgroundSettings(Section):
@@ -41,11 +45,14 @@ class RegionSettings(Section):
 class Detector(Protocol):
     """A source of evidence, asked frame by frame."""
 
-    def evidence(self, frame: Frame) -> Evidence:
-        """What a frame says."""
+    def evidence(self, frame: Frame, expected: Boxes) -> Evidence:
+        """What a frame says, in which boxes are expected."""
 
-    def learn(self, frame: Frame, followed: list[Array]) -> None:
-        """Adapt to a frame, except inside the outlines (k, 2) px of what is followed."""
+    def learn(self, frame: Frame, tracker: GroundTracker) -> None:
+        """Adapt to a frame, except where something is followed."""
+
+    def report(self) -> dict[str, Any] | None:
+        """Where the sun stands, where that was found."""
 
 
 class MovingRegions:
@@ -68,18 +75,31 @@ class MovingRegions:
         )
         self._background.start(empty)
         self._watched = None if region is None else region.picture(camera)
+        self._sun, self._shade = Sun(camera), Shade()
+        self._labels = np.zeros((0, 0), np.uint8)
 
-    def evidence(self, frame: Frame) -> Evidence:
+    def evidence(self, frame: Frame, expected: Boxes) -> Evidence:
         labels = self._background.detect(frame.image)
         if self._watched is not None:
             labels = np.asarray(cv2.bitwise_and(labels, self._watched), dtype=np.uint8)
+        if self._sun.shadow is not None and len(expected[0]):
+            where = shadow_picture(self._camera, *expected, self._sun.shadow.per_metre)
+            labels = self._shade.cut(labels, frame.image, self._background.picture, where)
+        self._labels = labels
         return LabelEvidence(labels, self._camera, self._bands, *self._cleaning)
 
-    def learn(self, frame: Frame, followed: list[Array]) -> None:
+    def learn(self, frame: Frame, tracker: GroundTracker) -> None:
+        pose, size = tracker.boxes()
+        settled = np.array([len(t.samples) >= SETTLED and t.samples[-1].measured for t in tracker.tracks], dtype=bool)
+        self._sun.look(frame.t, self._labels, pose, size, settled, [track.id for track in tracker.tracks])
+        followed = tracker.outlines()
         lens = self._camera.ground.lens
         if lens is not None:
             followed = [distort_points(outline, lens) for outline in followed if len(outline)]
         self._background.learn(frame.image, frame.t, followed)
+
+    def report(self) -> dict[str, Any] | None:
+        return None if self._sun.shadow is None else self._sun.shadow.report()
 
 
 class Detections:
@@ -88,7 +108,7 @@ class Detections:
     def __init__(self, camera: GroundCamera, boxes: dict[int, Array], region: Region | None = None) -> None:
         self._camera, self._boxes, self._region = camera, boxes, region
 
-    def evidence(self, frame: Frame) -> Evidence:
+    def evidence(self, frame: Frame, expected: Boxes) -> Evidence:
         rows = self._boxes.get(frame.index, np.zeros((0, 5)))
         if frame.image_from_rest is not None:
             middle = np.asarray(rows[:, :2] + rows[:, 2:4] / 2, dtype=float)
@@ -104,5 +124,8 @@ class Detections:
             found = [each for each, kept in zip(found, near, strict=True) if kept]
         return BoxEvidence(found, self._camera)
 
-    def learn(self, frame: Frame, followed: list[Array]) -> None:
+    def learn(self, frame: Frame, tracker: GroundTracker) -> None:
         """Boxes from outside need no background."""
+
+    def report(self) -> dict[str, Any] | None:
+        return None

@@ -78,7 +78,7 @@ class GroundTracker:
             self._measure(frame, evidence)
         self._remember(frame, evidence)
         self._reconsider(evidence)
-        self.unexplained = evidence.leftovers(*self._boxes())
+        self.unexplained = evidence.leftovers(*self.boxes())
         self._nursery.feed(frame, self._t, self.unexplained)
         self.next_id = self._nursery.born(self.next_id, self.tracks, self._held, self._recent, self._boxes_at)
         self._held += self._end()
@@ -92,13 +92,18 @@ class GroundTracker:
 
     def outlines(self) -> list[Array]:
         """Outlines (k, 2) px of the followed targets, as last known."""
-        return [wireframe.silhouette(self.camera, *box) for box in zip(*self._boxes(), strict=True)]
+        return [wireframe.silhouette(self.camera, *box) for box in zip(*self.boxes(), strict=True)]
 
     def headings(self) -> list[float]:
         """Headings (rad) of the followed targets, as last known."""
         return [float(self.dynamics.heading(track.steps[-1].posterior.mean)) for track in self.tracks]
 
-    def _boxes(self) -> tuple[Array, Array]:
+    def expected(self) -> Boxes:
+        """Pose (N, 3) and size (N, 3) of the tracks where they are predicted."""
+        pose = [self._pose_of(prediction.prior.mean) for prediction in self._expected]
+        return np.array(pose).reshape(-1, 3), np.array([track.size for track in self.tracks]).reshape(-1, 3)
+
+    def boxes(self) -> Boxes:
         """Pose (N, 3) and size (N, 3) of the tracks, as last known."""
         pose = [self._pose_of(track.steps[-1].posterior.mean) for track in self.tracks]
         return np.array(pose).reshape(-1, 3), np.array([track.size for track in self.tracks]).reshape(-1, 3)
@@ -229,7 +234,7 @@ class GroundTracker:
     def _end(self) -> list[Track]:
         ended: list[Track] = []
         alive: list[Track] = []
-        pose, size = self._boxes()
+        pose, size = self.boxes()
         pixels, _ = project(self.camera, wireframe.corners(pose, size))
         low, high = pixels.min(axis=1), pixels.max(axis=1)
         inside = np.clip(np.minimum(high, self.camera.image_size) - np.maximum(low, 0), 0, None)

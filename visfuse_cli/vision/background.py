@@ -60,6 +60,12 @@ class Background:
             self._model.apply(picture, learningRate=rate)
         self._picture, self._corrected, self._compared = picture.copy(), None, None
 
+    @property
+    def picture(self) -> Image:
+        """The scene without what moves (H, W, 3), as far as it is known."""
+        assert self._picture is not None
+        return self._picture
+
     def detect(self, image: Image) -> Image:
         """Label each pixel of `image` (H, W, 3): 255 foreground, 127 shadow, 0 background, without learning it."""
         self._labels = np.asarray(self._model.apply(image, learningRate=self._looking), dtype=np.uint8)
