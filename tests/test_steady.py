@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from visfuse_cli.records import Frame
+from visfuse_cli.tracking.annotate import RED, mark_camera
 from visfuse_cli.tracking.camera_watch import CameraWatch
 from visfuse_cli.vision.exposure import Exposure, levelled
 from visfuse_cli.vision.steady import Steady, at_rest, moved
@@ -151,3 +152,18 @@ def test_a_covered_camera_is_not_measured():
     assert watch.was_lost(2.0)
     assert not watch.was_lost(2.5)
     assert "could not be recognised for 0.96 s, first at 1.20 s" in watch.warnings("a.mp4")[0]
+
+
+def test_the_video_says_what_the_watch_found():
+    watch = CameraWatch(_seen(_scene(), np.eye(3)))
+    watch.lost.append([2.0, 3.0])
+    watch.moves.append({"t": 5.0, "px": 9.0})
+    red, written = [], []
+    for t in (1.0, 2.5, 6.0):
+        picture = np.zeros((360, 640, 3), np.uint8)
+        mark_camera(Frame("image", 0, t, picture), watch)
+        red.append(bool((picture[0, 320] == RED).all()))
+        written.append(int(np.flatnonzero((picture[325:353, 6:630] > 90).any(axis=(0, 2))).max()))
+    assert red == [False, True, False]
+    assert written[1] > written[0] + 100
+    assert written[2] > written[0] + 100

@@ -22,7 +22,7 @@ from visfuse_cli.vision.steady import moved
 
 TRAIL_S = 2.0
 PLACE_STEP_M = 1.0
-PALE = (200, 220, 220)
+PALE, RED = (200, 220, 220), (60, 60, 255)
 UNITS = {"km/h": KMH, "mph": 2.2369362920544, "m/s": 1.0}
 
 
@@ -131,6 +131,18 @@ def annotate(
             place.draw(frame.image, here)
         for drawn in active:
             drawn.draw(frame.image, frame.index, here)
-        note = f"{frame.t:.2f} s" + ("  camera moved: not measured" if watch.was_lost(frame.t) else "")
-        drawing.label(frame.image, note, np.array([4.0, frame.image.shape[0]]), (230, 230, 230))
+        mark_camera(frame, watch)
         yield frame
+
+
+def mark_camera(frame: Frame, watch: CameraWatch) -> None:
+    """Write the time, and what the watch over the camera says of it; a frame in red is not measured."""
+    high, wide = frame.image.shape[:2]
+    note, colour = f"{frame.t:.2f} s", (230, 230, 230)
+    if watch.was_lost(frame.t):
+        note, colour = f"{note}  scene not recognised: not measured", RED
+        border = np.array([[0, 0], [wide - 1, 0], [wide - 1, high - 1], [0, high - 1]], dtype=float)
+        drawing.polyline(frame.image, border, RED, closed=True, width=max(4, high // 90))
+    elif (move := watch.last_move(frame.t)) is not None:
+        note = f"{note}  camera moved by {move['px']:.1f} px at {move['t']:.1f} s: registered"
+    drawing.label(frame.image, note, np.array([4.0, high]), colour)

@@ -74,6 +74,10 @@ class CameraWatch:
         """Whether the scene could not be found at t (s)."""
         return any(first <= t <= last for first, last in self.lost)
 
+    def last_move(self, t: float) -> dict[str, float] | None:
+        """When (s) and how far (px) the camera was moved last before t (s); None where it was not."""
+        return next((move for move in reversed(self.moves) if move["t"] <= t), None)
+
     def report(self) -> dict[str, Any]:
         """What run.json says about the camera: shake (px rms), moves, stretches (s) not measured, range of the gain."""
         shake = float(np.sqrt(self._squares / self._count)) if self._count else 0.0

@@ -75,7 +75,7 @@ class MovingRegions:
         )
         self._background.start(empty)
         self._watched = None if region is None else region.picture(camera)
-        self._sun, self._shade = Sun(camera), Shade()
+        self._sun, self._shade = Sun(camera), Shade(background.shadow_ratio)
         self._labels = np.zeros((0, 0), np.uint8)
 
     def evidence(self, frame: Frame, expected: Boxes) -> Evidence:

@@ -27,6 +27,7 @@ SPREAD = 0.97  # length of the mean direction of what is likely: above, there is
 ENOUGH = 120  # looks after which the sun is known well
 DARKER = 0.92  # of the background: what is no darker is no shadow
 COLOUR = 14.0  # grey levels that a shadow may change the colour by
+CLEAR = 1.15  # times as light as the darkest that colour takes for shadow: it needs no help
 ALIKE = 0.35  # of the usual darkness that shadows may differ by
 SAMPLES, KNOWN, LEAST_DARK_PX = 60, 10, 40  # pictures that tell how dark shadows are, and pixels of one that do
 
@@ -138,7 +139,8 @@ def shadow_picture(camera: GroundCamera, pose: Array, size: Array, per_metre: Ar
 class Shade:
     """How dark shadows are, learnt where geometry says that they fall, and what is cut off the foreground by it."""
 
-    def __init__(self) -> None:
+    def __init__(self, ratio: float) -> None:
+        self._ratio = ratio  # darkest that colour alone takes for shadow, as a share of the lit ground
         self._found: deque[float] = deque(maxlen=SAMPLES)
 
     def cut(self, labels: Image, image: Image, empty: Image, where: Image) -> Image:
@@ -155,6 +157,8 @@ class Shade:
         if len(self._found) < KNOWN:
             return labels
         usual = float(np.median(self._found))
+        if usual > CLEAR * self._ratio:
+            return labels
         shadow = darker & (np.abs(share - usual) < ALIKE * usual) & (labels[v, u] == FOREGROUND)
         cleaned = labels.copy()
         cleaned[v[shadow], u[shadow]] = SHADOW
