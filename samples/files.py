@@ -1,4 +1,4 @@
-"""A scene's files: clip.mp4, points.csv, truth.csv, vehicles.csv."""
+"""A scene's files: clip.mp4, points.csv, truth.csv, drives.csv, vehicles.csv."""
 
 from __future__ import annotations
 
@@ -12,29 +12,32 @@ from numpy.typing import NDArray
 
 from samples.render import frames
 from samples.road import calibration_points
-from samples.scene import Scene
+from samples.scene import Array, Scene
 from samples.visibility import truth_rows
 
 
 def write_scene(scene: Scene, out: Path, *, noise_px: float = 0.4, crf: int = 23, n_points: int = 10) -> None:
-    """Write the scene's four files to the folder `out`; the same scene gives the same bytes."""
+    """Write the scene's files to the folder `out`; the same scene gives the same bytes.
+
+    truth.csv has the vehicles where they can be seen, drives.csv all of them all the time.
+    """
     out.mkdir(parents=True, exist_ok=True)
     points = calibration_points(scene, n_points, noise_px)
     _table(out / "points.csv", "u,v,X,Y", (f"{u:.3f},{v:.3f},{x:.4f},{y:.4f}" for u, v, x, y in points))
-    _table(
-        out / "truth.csv",
-        "frame,t,id,x,y,z,vx,vy,vz",
-        (
-            f"{frame},{t:.9f},{number},{s[0]:.4f},{s[1]:.4f},,{s[3]:.4f},{s[4]:.4f},"
-            for frame, t, number, s in truth_rows(scene)
-        ),
-    )
+    _states(out / "truth.csv", truth_rows(scene))
+    _states(out / "drives.csv", all_rows(scene))
     _table(
         out / "vehicles.csv",
         "id,class,length,width,height",
         (f"{v.id},{v.kind},{v.length:.2f},{v.width:.2f},{v.height:.2f}" for v in scene.vehicles),
     )
     write_clip(out / "clip.mp4", frames(scene), scene.camera.size, scene.fps, crf)
+
+
+def all_rows(scene: Scene) -> list[tuple[int, float, int, Array]]:
+    """(frame, t, id, state (5,)) of every vehicle in every frame."""
+    states = {vehicle.id: vehicle.trajectory(scene.times) for vehicle in scene.vehicles}
+    return [(k, float(t), number, states[number][k]) for k, t in enumerate(scene.times) for number in sorted(states)]
 
 
 def write_clip(
@@ -53,6 +56,11 @@ def write_clip(
             frame.pts, frame.time_base = index, 1 / fps
             container.mux(stream.encode(frame))
         container.mux(stream.encode())
+
+
+def _states(path: Path, rows: list[tuple[int, float, int, Array]]) -> None:
+    lines = (f"{frame},{t:.9f},{number},{s[0]:.4f},{s[1]:.4f},,{s[3]:.4f},{s[4]:.4f}," for frame, t, number, s in rows)
+    _table(path, "frame,t,id,x,y,z,vx,vy,vz", lines)
 
 
 def _table(path: Path, header: str, rows: Iterable[str]) -> None:

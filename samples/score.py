@@ -7,6 +7,9 @@ import json
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
 
 
 def rows(path: Path) -> list[dict[str, str]]:
@@ -18,21 +21,34 @@ def rows(path: Path) -> list[dict[str, str]]:
 def matches(run: Path, truth: Path, reach_m: float = 2.0) -> list[tuple[dict[str, str], float, float, int | None]]:
     """For each row: itself, the true mean speed over its own stretch, the share of time within reach, the vehicle."""
     tracks = {track["id"]: track for track in json.loads((run / "tracks.json").read_text())["tracks"]}
-    true: dict[int, list[list[float]]] = {}
-    for row in rows(truth):
-        true.setdefault(int(row["id"]), []).append([float(row[k]) for k in ("t", "x", "y", "vx", "vy")])
+    true = _states(truth)
+    # a track may begin where the vehicle is hardly in the picture yet; its speed there is wanted all the same
+    drives = _states(truth.with_name("drives.csv")) if truth.with_name("drives.csv").exists() else true
     found = []
     for row in rows(run / "speeds.csv"):
         states = tracks[int(row["track_id"])]["states"]
         t = np.array([s["t"] for s in states])
         xy = np.array([s["position"] for s in states])
         best: tuple[float, int | None, float] = (0.0, None, np.nan)
-        for vehicle, values in true.items():
-            v = np.array(values)
+        for vehicle, v in true.items():
             at = [np.interp(v[:, 0], t, xy[:, k], left=np.nan, right=np.nan) for k in (0, 1)]
             share = float(np.mean(np.hypot(at[0] - v[:, 1], at[1] - v[:, 2]) < reach_m))
             if share > best[0]:
-                inside = (v[:, 0] >= float(row["t_start"]) - 1e-6) & (v[:, 0] <= float(row["t_end"]) + 1e-6)
-                best = (share, vehicle, float(np.hypot(v[inside, 3], v[inside, 4]).mean() * 3.6))
+                best = (share, vehicle, _mean_speed(drives[vehicle], float(row["t_start"]), float(row["t_end"])))
         found.append((row, best[2], best[0], best[1]))
     return found
+
+
+def _states(path: Path) -> dict[int, Array]:
+    """Vehicle -> (n, 5) t, x, y, vx, vy."""
+    states: dict[int, list[list[float]]] = {}
+    for row in rows(path):
+        states.setdefault(int(row["id"]), []).append([float(row[k]) for k in ("t", "x", "y", "vx", "vy")])
+    return {vehicle: np.array(values) for vehicle, values in states.items()}
+
+
+def _mean_speed(states: Array, begin: float, end: float) -> float:
+    """Way by time (km/h) between two times (s) that lie on frames."""
+    inside = (states[:, 0] >= begin - 1e-6) & (states[:, 0] <= end + 1e-6)
+    speed = np.hypot(states[inside, 3], states[inside, 4])
+    return float(np.mean((speed[1:] + speed[:-1]) / 2) * 3.6)

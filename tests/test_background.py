@@ -4,7 +4,8 @@ import cv2
 import numpy as np
 import pytest
 
-from visfuse_cli.vision.background import FOREGROUND, SHADOW, STILL_S, Background, empty_picture
+from visfuse_cli.vision.background import FOREGROUND, SHADOW, STILL_S, Background
+from visfuse_cli.vision.empty import empty_picture
 from visfuse_cli.vision.ghosts import find_ghosts
 
 HIGH, WIDE = 120, 160

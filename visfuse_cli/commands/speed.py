@@ -45,7 +45,7 @@ from visfuse_cli.tracking.summary import summarised, text
 from visfuse_cli.tracking.targets import Abandoned, Track
 from visfuse_cli.tracking.verdict import judge
 from visfuse_cli.tracking.zones import Region, trusted
-from visfuse_cli.vision.background import empty_picture
+from visfuse_cli.vision.empty import empty_picture
 from visfuse_cli.vision.steady import at_rest
 
 __all__ = ["SpeedConfig", "run", "text"]

@@ -36,7 +36,7 @@ from visfuse_cli.maths.planes import triangulated
 from visfuse_cli.pipeline import Run
 from visfuse_cli.records import Array, FrameSet, GivenTarget, Image, Lens, RunRequest, RunResult, StereoRig
 from visfuse_cli.vision import patches
-from visfuse_cli.vision.background import empty_picture
+from visfuse_cli.vision.empty import empty_picture
 from visfuse_cli.vision.epipolar_check import epipolar_residual
 from visfuse_cli.vision.epipolar_match import match
 from visfuse_cli.vision.lens import undistort_points

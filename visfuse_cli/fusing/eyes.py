@@ -16,7 +16,7 @@ from visfuse_cli.fusing.tracker import Newcomer, Tracker
 from visfuse_cli.maths import multiview
 from visfuse_cli.records import Array, Frame, FrameSet, Image, Sighting, View
 from visfuse_cli.threads import thread_cap
-from visfuse_cli.vision.background import empty_picture
+from visfuse_cli.vision.empty import empty_picture
 from visfuse_cli.vision.straighten import Straight
 
 WARMUP_PICTURES = 41

@@ -11,6 +11,7 @@ from visfuse_cli.records import Array, Region
 INSIDE = 0.6  # share of a region inside an expected box that makes it a part of that thing
 COVERED = 0.5  # share of an expected box under one region that makes the thing a part of that region
 LEAST_IOU = 0.2
+INNER = np.array([[i, j] for i in (-0.4, -0.2, 0.0, 0.2, 0.4) for j in (-0.3, 0.0, 0.3)])  # of a length and a width
 YOUNGER = 0.1  # of overlap: what the first of the expected things is given before the last
 
 
@@ -45,9 +46,23 @@ def claim(regions: list[Region], expected: Array) -> NDArray[np.intp]:
     return given
 
 
-def footprint_contains(outer_pose: Array, outer_size: Array, point: Array) -> bool:
-    """Whether a ground point (2,) lies inside a box's footprint."""
-    offset = point - outer_pose[:2]
-    c, s = np.cos(outer_pose[2]), np.sin(outer_pose[2])
-    along, across = c * offset[0] + s * offset[1], -s * offset[0] + c * offset[1]
-    return bool(abs(along) < outer_size[0] / 2 and abs(across) < outer_size[1] / 2)
+def footprint_overlap(pose: Array, size: Array, other_pose: Array, other_size: Array) -> Array:
+    """How much (N, M) of the inner part of the smaller footprint lies in the larger one, of N boxes and M others.
+
+    pose (N, 3), size (N, 3), other_pose (M, 3), other_size (M, 3): two things cannot stand in one place.
+    """
+    ours = _covered(pose, size, other_pose, other_size)
+    theirs = _covered(other_pose, other_size, pose, size).T
+    return np.maximum(ours, theirs)
+
+
+def _covered(pose: Array, size: Array, other_pose: Array, other_size: Array) -> Array:
+    """Share (N, M) of points spread over the inner part of each footprint that lie in the other's."""
+    c, s = np.cos(pose[:, 2, None]), np.sin(pose[:, 2, None])
+    along, across = INNER[:, 0] * size[:, :1], INNER[:, 1] * size[:, 1:2]
+    points = pose[:, None, :2] + np.stack([c * along - s * across, s * along + c * across], axis=-1)  # (N, P, 2)
+    off = points[:, None] - other_pose[:, None, :2]  # (N, M, P, 2)
+    c, s = np.cos(other_pose[:, 2, None]), np.sin(other_pose[:, 2, None])
+    inside = np.abs(c * off[..., 0] + s * off[..., 1]) < other_size[:, :1] / 2
+    inside &= np.abs(-s * off[..., 0] + c * off[..., 1]) < other_size[:, 1:2] / 2
+    return np.asarray(inside.mean(axis=-1))

@@ -12,17 +12,21 @@ from visfuse_cli.maths.cameras import ground_scale
 from visfuse_cli.records import Array, GroundCamera, Region
 from visfuse_cli.tracking import dynamics as dynamics_tools
 from visfuse_cli.tracking import measure
-from visfuse_cli.tracking.association import claim, region_boxes
+from visfuse_cli.tracking.association import claim, footprint_overlap, region_boxes
 from visfuse_cli.tracking.dynamics import Dynamics, Step
-from visfuse_cli.tracking.evidence import Boxes
+from visfuse_cli.tracking.evidence import Boxes, Evidence, LabelEvidence
 from visfuse_cli.tracking.hypotheses import HEADING_SIGMA, Guess, best_guess
 from visfuse_cli.tracking.joining import part_before
 from visfuse_cli.tracking.lookback import Recent, trace
+from visfuse_cli.tracking.scan import headings, scan, velocity_of
 from visfuse_cli.tracking.settings import TrackerSettings
 from visfuse_cli.tracking.targets import Abandoned, Sample, Track
 from visfuse_cli.vision import wireframe
+from visfuse_cli.vision.points import Courses, MovingPoints
 from visfuse_cli.vision.wireframe import DIRECTIONS, Outlines
 
+SCAN_S = 0.3  # s between searches inside of regions
+MOST_GROWN = 2  # of the boxes found there that are followed back
 ASK_AGAIN_S = 0.1  # s until a candidate that was none is looked at again
 COURSE_FRAMES = 25  # the last frames of a candidate that tell its course
 SEEN = 0.6  # share of the frames of a new track in which its vehicle is seen
@@ -40,6 +44,7 @@ class Candidate:
     drift: Array = field(default_factory=lambda: np.zeros(2))  # px/s
     missed_since: float | None = None
     asked_again: float = 0.0  # s: not before
+    scanned_again: float = 0.0  # s: not before
 
 
 class Nursery:
@@ -48,6 +53,12 @@ class Nursery:
     def __init__(self, camera: GroundCamera, settings: TrackerSettings, dynamics: Dynamics) -> None:
         self._camera, self._settings, self._dynamics = camera, settings, dynamics
         self._candidates: list[Candidate] = []
+        self._points = MovingPoints(camera)
+
+    def watch(self, t: float, evidence: Evidence) -> None:
+        """Follow the corners of what moves."""
+        if isinstance(evidence, LabelEvidence) and (picture := evidence.picture()) is not None:
+            self._points.follow(picture, t, evidence.paint())
 
     def feed(self, frame: int, t: float, regions: list[Region]) -> None:
         """Give the frame's unexplained regions to candidates, new ones where none fits."""
@@ -84,7 +95,63 @@ class Nursery:
                 tracks.append(track)
                 next_id = max(next_id, track.id + 1)
         self._candidates = waiting
+        return self._scanned(next_id, tracks, held, recent, taken_at)
+
+    def _scanned(
+        self, next_id: int, tracks: list[Track], held: list[Track], recent: Recent, taken_at: Callable[[int], Boxes]
+    ) -> int:
+        """Add the vehicles found inside of regions to `tracks`; the next free id."""
+        frame, t, evidence = recent[-1]
+        due = [c for c in self._candidates if c.missed_since is None and t >= c.scanned_again]
+        if not due or not isinstance(evidence, LabelEvidence):
+            return next_id
+        courses = self._points.courses()
+        for candidate in due:
+            candidate.scanned_again = t + SCAN_S
+            guesses = self._guessed(candidate.region, evidence, courses, taken_at(frame))
+            grown = [
+                track
+                for guess, velocity in guesses[:MOST_GROWN]
+                if (track := self.grown(guess, velocity, next_id, recent, taken_at, held)) is not None
+            ]
+            if grown:
+                track = max(grown, key=_seen)
+                tracks.append(track)
+                next_id = max(next_id, track.id + 1)
         return next_id
+
+    def _guessed(
+        self, region: Region, evidence: LabelEvidence, courses: Courses, taken: Boxes
+    ) -> list[tuple[Guess, Array]]:
+        """Boxes that explain a part of a region, with their velocities (2,) m/s; the one that explains most first."""
+        low, high = region.box[:2], region.box[:2] + region.box[2:]
+        here = courses[np.all((courses.place >= low) & (courses.place <= high), axis=1)]
+        found = []
+        for heading in headings(here.course):
+            guesses = scan(self._camera, self._settings, evidence, region.box, region.around_area, heading, taken)
+            velocities = [velocity_of(self._camera, guess, here) for guess in guesses]
+            found += [(guess, v) for guess, v in zip(guesses, velocities, strict=True) if v is not None]
+        return sorted(found, key=lambda each: -each[0].gain)
+
+    def rival(self, evidence: Evidence, box: Array, taken: Boxes) -> Guess | None:
+        """The best other box for what stands where a box (6,) of pose and size is believed, among those `taken`."""
+        hull = wireframe.silhouette(self._camera, box[:3], box[3:])
+        if not len(hull):
+            return None
+        expected = np.concatenate([hull.min(axis=0), hull.max(axis=0)])
+        guesses: list[Guess] = []
+        regions = evidence.leftovers(*taken)
+        found = claim(regions, expected[None])[0]
+        if found >= 0:
+            guess = best_guess(self._camera, self._settings, evidence, regions[found], float(box[2]), taken)
+            guesses += [guess] if guess is not None else []
+        if isinstance(evidence, LabelEvidence):
+            place = np.append(expected[:2], expected[2:] - expected[:2])
+            guesses += scan(self._camera, self._settings, evidence, place, np.inf, float(box[2]), taken)
+        here = [
+            g for g in guesses if footprint_overlap(g.pose[None], g.size[None], box[None, :3], box[None, 3:])[0, 0] > 0
+        ]
+        return max(here, key=lambda guess: guess.gain, default=None)
 
     def give_up(self, t: float) -> list[Abandoned]:
         """The candidates that were lost or have stood too long."""
@@ -209,6 +276,11 @@ class Nursery:
             else:
                 steps.append(dynamics_tools.coast(expected))
         return steps
+
+
+def _seen(track: Track) -> float:
+    """How much of a track's border was seen, on average."""
+    return float(np.mean([sample.border for sample in track.samples if sample.border >= 0]))
 
 
 def velocity_at_start(samples: list[Sample], pose: Array) -> Array:

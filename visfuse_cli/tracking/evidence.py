@@ -13,7 +13,8 @@ from visfuse_cli.maths.cameras import project
 from visfuse_cli.records import Array, GroundCamera, Image, Region
 from visfuse_cli.tracking.association import overlap, region_boxes
 from visfuse_cli.vision import contour, regions, wireframe
-from visfuse_cli.vision.contour import Look
+from visfuse_cli.vision.background import FOREGROUND
+from visfuse_cli.vision.contour import Fill, Look
 from visfuse_cli.vision.labels import Labels
 from visfuse_cli.vision.regions import Band
 from visfuse_cli.vision.wireframe import Outlines
@@ -43,14 +44,26 @@ class LabelEvidence:
     """A labelled picture (255 foreground, 127 shadow)."""
 
     def __init__(
-        self, labels: Image, camera: GroundCamera, cut: list[Band], gap_m: float, speck_m: float, smallest_m: float
+        self,
+        labels: Image,
+        camera: GroundCamera,
+        cut: list[Band],
+        gap_m: float,
+        speck_m: float,
+        smallest_m: float,
+        grey: Image | None = None,
     ) -> None:
-        self._labels = Labels(labels)
+        self._labels, self._grey = Labels(labels), grey
         self._camera, self._cut = camera, cut
         self._cleaning = gap_m, speck_m, smallest_m
 
     def pack(self) -> None:
         self._labels.pack()
+        self._grey = None
+
+    def picture(self) -> Image | None:
+        """The grey picture (H, W) of the present frame; None of a past one, or where there is none."""
+        return self._grey
 
     def look(self, pose: Array, size: Array, reach: Array) -> Look:
         owner = contour.owners(self._camera, pose, size)
@@ -60,9 +73,23 @@ class LabelEvidence:
         owner = contour.owners(self._camera, *taken)
         return contour.search(self._labels, owner, np.zeros(len(pose), int), self._camera, pose, size, reach)
 
+    def fill(self, pose: Array, size: Array, taken: Boxes) -> Fill:
+        """A quick look at each of N boxes as if it alone stood among those `taken`."""
+        return contour.fill(self._labels, contour.owners(self._camera, *taken), self._camera, pose, size)
+
     def leftovers(self, pose: Array, size: Array) -> list[Region]:
-        labels = self._labels.picture()
-        explained = np.zeros_like(labels)
+        found = regions.find(self._labels.picture(), self._cut, *self._cleaning, self._explained(pose, size))
+        lens = self._camera.ground.lens
+        return found if lens is None else [regions.undistorted(region, lens) for region in found]
+
+    def paint(self) -> Image:
+        """Mask (H, W), 255 where something differs from the background that is no shadow."""
+        return np.asarray(cv2.compare(self._labels.picture(), FOREGROUND, cv2.CMP_EQ), dtype=np.uint8)
+
+    def _explained(self, pose: Array, size: Array) -> Image:
+        """Mask (H, W), 255 in and close to the silhouettes of N boxes."""
+        width, height = self._camera.image_size
+        explained = np.zeros((height, width), np.uint8)
         pixels, _ = project(self._camera, wireframe.corners(pose, size))
         for corner in pixels:
             if np.isfinite(corner).all():
@@ -70,9 +97,7 @@ class LabelEvidence:
                 margin = max(2, round(MARGIN * float(np.ptp(corner, axis=0).max())))
                 cv2.fillConvexPoly(explained, hull, 255)
                 cv2.polylines(explained, [hull], True, 255, 2 * margin + 1)
-        found = regions.find(labels, self._cut, *self._cleaning, explained)
-        lens = self._camera.ground.lens
-        return found if lens is None else [regions.undistorted(region, lens) for region in found]
+        return explained
 
 
 class BoxEvidence:
@@ -87,7 +112,7 @@ class BoxEvidence:
         for region, thing in self._pairs(pose, size)[0]:
             seen[thing] = self._sides(region)
             share[thing] = 1.0
-        return Look(Outlines.stack(seen), share, share, share, share, share)
+        return Look(Outlines.stack(seen), share, share, share, share, share, share, share)
 
     def probe(self, pose: Array, size: Array, reach: Array, taken: Boxes) -> Look:
         free = set(self._pairs(*taken)[1].tolist())
@@ -99,7 +124,7 @@ class BoxEvidence:
                 if iou[best, thing] >= LEAST_IOU:
                     seen[thing] = self._sides(best)
                     share[thing] = 1.0
-        return Look(Outlines.stack(seen), share, share, share, share, share)
+        return Look(Outlines.stack(seen), share, share, share, share, share, share, share)
 
     def pack(self) -> None:
         """A few boxes are little."""

@@ -15,11 +15,11 @@ from visfuse_cli.records import Array, GroundCamera
 from visfuse_cli.records import Region as ImageRegion
 from visfuse_cli.tracking import dynamics as dynamics_tools
 from visfuse_cli.tracking import measure
-from visfuse_cli.tracking.association import claim, footprint_contains
+from visfuse_cli.tracking.association import footprint_overlap
 from visfuse_cli.tracking.births import Nursery
 from visfuse_cli.tracking.dynamics import Dynamics, Prediction, Step
 from visfuse_cli.tracking.evidence import Boxes, Evidence
-from visfuse_cli.tracking.hypotheses import best_guess, gain_of
+from visfuse_cli.tracking.hypotheses import gain_of
 from visfuse_cli.tracking.joining import WAIT_S
 from visfuse_cli.tracking.lookback import LEAST_OPEN, Recent
 from visfuse_cli.tracking.settings import TrackerSettings
@@ -34,9 +34,10 @@ LIKENESS_S, UNLIKE = 0.4, 0.5  # s over which the share of the border that is fo
 DOUBTFUL, MOVED_M = 0.25, 2.0  # share of the border that is not clear, to compare, and again so many m further
 WAIT_AT_MOST_S = 1.0  # before a doubtful track is compared again
 KEPT = 0.9  # of its frames and of the outline seen in them a track keeps when its box is exchanged
-BETTER = 1.2  # times as much must another box explain
+BETTER, MUCH_BETTER = 1.2, 2.0  # times as much must another box explain, and to be taken though seen for less time
 LOOK_BACK_FRAMES = 120  # at most
-REACH_PX = (4.0, 24.0)  # how far from its prediction an outline is looked for
+REACH_PX, REACH_SHARE = (4.0, 24.0), 0.2  # how far from its prediction an outline is looked for; of its height
+ONE_PLACE = 0.4  # of a footprint in another's: one of the two is wrong
 
 
 class GroundTracker:
@@ -78,6 +79,7 @@ class GroundTracker:
             self._measure(frame, evidence)
         self._remember(frame, evidence)
         self._reconsider(evidence)
+        self._nursery.watch(self._t, evidence)
         self.unexplained = evidence.leftovers(*self.boxes())
         self._nursery.feed(frame, self._t, self.unexplained)
         self.next_id = self._nursery.born(self.next_id, self.tracks, self._held, self._recent, self._boxes_at)
@@ -138,16 +140,16 @@ class GroundTracker:
         sigma = np.array([track.size_sigma for track in self.tracks])
         look = evidence.look(pose, size, self._reach(pose))
         fit = measure.fit_poses(self.camera, look.outlines, pose, size, sigma, self.settings.pose)
-        border = look.border * fit.agreed
+        border = np.where(np.isnan(look.likeness), look.border, look.likeness) * fit.agreed
         there = fit.ok & measure.looks_right(fit, look.outlines) & (look.moved > SEEN_SHARE) & ~(border < SEEN_SHARE)
         there &= look.open > LEAST_OPEN
         for k, track in enumerate(self.tracks):
             step = dynamics_tools.coast(self._expected[k])
             if np.isfinite(border[k]):
-                elapsed = self._t - track.samples[-1].t
-                share = min(1.0, elapsed / LIKENESS_S)
+                share = min(1.0, (self._t - track.samples[-1].t) / LIKENESS_S)
                 track.likeness += (border[k] - track.likeness) * share
-                track.doubt += (1 - border[k] * np.nan_to_num(look.clear[k], nan=1.0) - track.doubt) * share
+                seen = look.border[k] * fit.agreed[k] * np.nan_to_num(look.clear[k], nan=1.0)
+                track.doubt += (1 - seen - track.doubt) * share
             sample = Sample(frame, self._t, look.outlines[k], float(border[k]), False)
             if there[k]:
                 z, R = self.dynamics.measured(*measure.measurement(fit, k, pose[k]))
@@ -174,22 +176,17 @@ class GroundTracker:
         )
         frame = self._recent[-1][0]
         taken = self._boxes_at(frame, without=track)
-        hull = wireframe.silhouette(self.camera, box[:3], box[3:])
-        if not len(hull):
+        guess = self._nursery.rival(evidence, box, taken)
+        if guess is None:
             return
-        regions = evidence.leftovers(*taken)
-        expected = np.concatenate([hull.min(axis=0), hull.max(axis=0)])[None]
-        found = claim(regions, expected)[0]
-        if found < 0:
-            return
-        guess = best_guess(self.camera, self.settings, evidence, regions[found], float(box[2]), taken)
-        if guess is None or guess.gain < BETTER * gain_of(self.camera, evidence, box[:3], box[3:], taken):
+        times = guess.gain / max(gain_of(self.camera, evidence, box[:3], box[3:], taken), 1e-9)
+        if not times > BETTER:
             return
         velocity = self.dynamics.planar(track.steps[-1].posterior.mean)[0][2:]
         before = partial(self._boxes_at, without=track)
         itself = [track]
         better = self._nursery.grown(guess, velocity, track.id, self._recent, before, itself)
-        if better is not None and not itself and _as_good(better, track):  # `itself`: not one that passes in front
+        if better is not None and not itself and (times > MUCH_BETTER or _as_good(better, track)):
             better.compared = track.compared
             self.tracks[self.tracks.index(track)] = better
 
@@ -205,11 +202,18 @@ class GroundTracker:
         return done
 
     def _reach(self, pose: Array) -> Array:
-        """How far off (N,) px the outlines may be: three deviations of the prediction."""
-        _, J = project(self.camera, np.column_stack([pose[:, :2], np.zeros(len(pose))]))
+        """How far off (N,) px the outlines may be: three deviations of the predicted place and of the size."""
+        feet = np.column_stack([pose[:, :2], np.zeros(len(pose))])
+        height, sigma = (
+            np.array([getattr(track, name)[2] for track in self.tracks]) for name in ("size", "size_sigma")
+        )
+        low, J = project(self.camera, feet)
+        high, _ = project(self.camera, feet + np.column_stack([0 * feet[:, :2], height]))
         cov = np.array([expected.prior.cov[:2, :2] for expected in self._expected])
         spread = np.einsum("nij,njk,nik->n", J[:, :, :2], cov, J[:, :, :2])  # trace: px^2
-        return np.clip(3 * np.sqrt(np.nan_to_num(spread)), *REACH_PX)
+        upright = np.nan_to_num(np.linalg.norm(high - low, axis=1))
+        reach = 3 * np.sqrt(np.nan_to_num(spread) + (upright * sigma / height) ** 2)
+        return np.clip(reach, REACH_PX[0], np.maximum(REACH_PX[1], REACH_SHARE * upright))
 
     def _plausible(self, track: Track, step: Step, z: Array, R: Array) -> bool:
         """Enough outline to place the box, inside the gate, and no leap of speed."""
@@ -241,11 +245,10 @@ class GroundTracker:
         outside = ~(np.prod(inside, axis=1) > LEAST_OPEN * np.prod(high - low, axis=1))
         feet, _ = project(self.camera, np.column_stack([pose[:, :2], np.zeros(len(pose))]))
         scale = ground_scale(self.camera, feet)
-        life = self.settings.life
+        life, twins = self.settings.life, self._twins(pose, size)
         for k, track in enumerate(self.tracks):
-            twin = self._twin(track, pose[k], alive)
-            if twin is not None:
-                ended.append(self._trimmed(track, f"same vehicle as track {twin.id}"))
+            if k in twins:
+                ended.append(self._trimmed(track, f"same vehicle as track {twins[k].id}"))
             elif outside[k]:
                 ended.append(self._trimmed(track, "left the picture"))
             elif self._region is not None and self._left(track, self._region):
@@ -269,13 +272,16 @@ class GroundTracker:
         inside = region.holds(places)
         return not inside[-1] and bool(inside[0] or not region.near(places[-1]))
 
-    def _twin(self, track: Track, pose: Array, others: list[Track]) -> Track | None:
-        """An older track in whose footprint this one stands: one vehicle followed twice."""
-        for other in others:
-            where = self._pose_of(other.steps[-1].posterior.mean)
-            if len(track.samples) < len(other.samples) and footprint_contains(where, other.size, pose[:2]):
-                return other
-        return None
+    def _twins(self, pose: Array, size: Array) -> dict[int, Track]:
+        """The tracks (by number) in whose place another one stands that looks more like a vehicle, and that one."""
+        shared = footprint_overlap(pose, size, pose, size) > ONE_PLACE
+        worth = [(round(track.likeness, 1), len(track.samples)) for track in self.tracks]
+        found: dict[int, Track] = {}
+        for k in np.argsort([-len(track.samples) for track in self.tracks]):
+            for other in np.flatnonzero(shared[k]):
+                if other != k and int(other) not in found and worth[other] > worth[k]:
+                    found[int(k)] = self.tracks[other]
+        return found
 
     def _trimmed(self, track: Track, reason: str) -> Track:
         """The track without the predictions after its last measurement."""

@@ -11,6 +11,7 @@ from visfuse_cli.maths import homography
 from visfuse_cli.maths.cameras import project
 from visfuse_cli.records import Array, GroundCamera, Region
 from visfuse_cli.tracking import measure
+from visfuse_cli.tracking.association import footprint_overlap
 from visfuse_cli.tracking.evidence import Boxes, Evidence
 from visfuse_cli.tracking.settings import SizePrior, TrackerSettings
 from visfuse_cli.vision import wireframe
@@ -19,8 +20,13 @@ from visfuse_cli.vision.contour import Look
 REACHES_PX = (24.0, 12.0, 6.0)  # how far around a hypothesis its border is looked for, coarse to fine
 BORDER_SEEN, AREA_MOVED = 0.6, 0.6  # shares of its border and its area that must be found
 CLEAR = 0.4  # share of its border that must have background outside: a window of a grey car has paint
+FOOT_SEEN = 0.5  # share of its border on the ground that must be found: a part of a vehicle stands on nothing
+OPEN, SHOWN = 0.5, 0.45  # of its area that must be in view, and of all of its border that must be found
+ONE_PLACE = 0.25  # of a footprint that may lie in another's
 PART = 0.3  # how much more of these is wanted of a box that explains next to nothing
+SOLID, LARGE_M = 0.75, 3.0  # share of paint in, and length of, what may stand amidst shadows: no window is like it
 SHADOW_ONLY, UNMOVED = 0.3, 0.5  # what a pixel of shadow, and one that did not move, counts against one of paint
+SHARPER = 3  # a box over two vehicles explains twice as much, but half of its border is in neither's
 UNUSUAL = 3.0  # deviations of a size from its class
 USUAL_WEIGHT = 0.02  # a tenth less, roughly, for a box that is two deviations from its class in one measure
 HEADING_SIGMA = 0.12  # rad: the course of a region's foot
@@ -48,14 +54,29 @@ def best_guess(
     Each class is tried with each of its ends aligned with the region's, and with the ends of all that moves with it,
     so that paint that is missing, a shadow or a neighbour does no harm.
     """
+    boxes = (region.box, region.around)
+    means = [measure.prior_arrays(prior)[0] for prior in settings.target.classes]
+    starts = [np.concatenate([_aligned(camera, box, heading, mean) for box in boxes]) for mean in means]
+    which = np.repeat(np.arange(len(means)), [len(start) for start in starts])
+    guesses = refined(camera, settings, evidence, which, np.concatenate(starts), region.around_area, taken)
+    return max(guesses, key=lambda guess: guess.gain, default=None)
+
+
+def refined(
+    camera: GroundCamera,
+    settings: TrackerSettings,
+    evidence: Evidence,
+    which: NDArray[np.intp],
+    pose: Array,
+    around_area: float | Array,
+    taken: Boxes,
+) -> list[Guess]:
+    """Boxes of classes `which` (N,) from poses (N, 3) fitted to what is seen, those that convince.
+
+    around_area (N,) px^2 is how much moves there and wants to be explained.
+    """
     classes = settings.target.classes
     priors = [measure.prior_arrays(prior) for prior in classes]
-    starts = [
-        np.concatenate([_aligned(camera, box, heading, mean) for box in (region.box, region.around)])
-        for mean, _ in priors
-    ]
-    which = np.repeat(np.arange(len(classes)), [len(start) for start in starts])
-    pose = np.concatenate(starts)
     mean, sigma = (np.stack([pair[k] for pair in priors])[which] for k in (0, 1))
     size = mean
     for reach in REACHES_PX:
@@ -63,33 +84,35 @@ def best_guess(
         fit = measure.fit_poses(camera, look.outlines, pose, mean, sigma, settings.pose, HEADING_SIGMA)
         pose, size = np.where(fit.ok[:, None], fit.pose, pose), np.where(fit.ok[:, None], fit.size, size)
     usual = np.all(np.abs(size - mean) < UNUSUAL * sigma, axis=1)
-    area = _area(camera, pose, size) * look.open
+    area = area_of(camera, pose, size) * look.open
     # A window of a grey car looks like a small vehicle: what explains little of all that moves must be seen clearly.
-    doubt = 1 - np.clip(area * look.moved / max(region.around_area, 1.0), 0, 1)
+    doubt = 1 - np.clip(area * look.moved / np.maximum(around_area, 1.0), 0, 1)
     clear = (look.border > BORDER_SEEN + PART * doubt) & (look.clear > CLEAR + PART * doubt)
-    good = fit.ok & usual & measure.looks_right(fit, look.outlines) & convincing(look) & clear
+    clear |= (look.border > BORDER_SEEN + PART / 2) & (look.paint > SOLID) & (mean[:, 0] > LARGE_M)
+    stands = ~(look.foot < FOOT_SEEN) & (look.open > OPEN) & (look.outlines.valid.mean(axis=1) > SHOWN)
+    stands &= ~np.any(footprint_overlap(pose, size, *taken) > ONE_PLACE, axis=1)
+    good = fit.ok & usual & measure.looks_right(fit, look.outlines) & clear & (look.moved > AREA_MOVED) & stands
     gain = _gain(look, area)
     good &= gain > 0
-    if not good.any():
-        return None
-    gain *= np.exp(-USUAL_WEIGHT * np.sum(((size - mean) / sigma) ** 2, axis=1))
-    best = int(np.argmax(np.where(good, gain, -np.inf)))
-    return Guess(classes[which[best]], pose[best], size[best], sigma[best], float(gain[best]))
+    gain = gain * np.exp(-USUAL_WEIGHT * np.sum(((size - mean) / sigma) ** 2, axis=1))
+    return [Guess(classes[which[k]], pose[k], size[k], sigma[k], float(gain[k])) for k in np.flatnonzero(good)]
 
 
 def gain_of(camera: GroundCamera, evidence: Evidence, pose: Array, size: Array, taken: Boxes) -> float:
     """How much one box with pose (3,) and size (3,) explains, as `Guess.gain`; NaN where it is hidden."""
     look = evidence.probe(pose[None], size[None], np.array(REACHES_PX[-1:]), taken)
-    return float(_gain(look, _area(camera, pose[None], size[None]) * look.open)[0])
+    return float(_gain(look, area_of(camera, pose[None], size[None]) * look.open)[0])
 
 
 def _gain(look: Look, area: Array) -> Array:
-    return area * (look.paint - SHADOW_ONLY * (look.moved - look.paint) - UNMOVED * (1 - look.moved)) * look.border
+    filled = look.paint - SHADOW_ONLY * (look.moved - look.paint) - UNMOVED * (1 - look.moved)
+    return np.sqrt(area) * filled * look.border**SHARPER
 
 
 def convincing(look: Look) -> NDArray[np.bool_]:
-    """Which (N,) of the boxes looked for are seen beyond doubt."""
-    return np.asarray((look.border > BORDER_SEEN) & (look.moved > AREA_MOVED) & (look.clear > CLEAR))
+    """Which (N,) of the boxes followed back are seen beyond doubt."""
+    clear = (look.clear > CLEAR) | (look.paint > SOLID)
+    return np.asarray((look.border > BORDER_SEEN) & (look.moved > AREA_MOVED) & clear)
 
 
 def _aligned(camera: GroundCamera, box: Array, heading: float, size: Array) -> Array:
@@ -108,7 +131,7 @@ def _aligned(camera: GroundCamera, box: Array, heading: float, size: Array) -> A
     return pose[np.isfinite(pose).all(axis=1)]
 
 
-def _area(camera: GroundCamera, pose: Array, size: Array) -> Array:
+def area_of(camera: GroundCamera, pose: Array, size: Array) -> Array:
     """Area (N,) of each silhouette, px^2."""
     pixels, _ = project(camera, wireframe.corners(pose, size))
     ends = np.nan_to_num(pixels)[:, wireframe.EDGES]

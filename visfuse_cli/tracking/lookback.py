@@ -22,6 +22,7 @@ from visfuse_cli.vision import wireframe
 
 REACH_PX = (4.0, 20.0)
 LEAST_OPEN = 0.2  # of a box in view to measure it
+PROOF, PROVEN = 10, 0.5  # frames after which a thing that was seen in few of them is none
 LOST_S = 0.3  # s without the thing: it was not there before
 
 Recent = deque[tuple[int, float, Evidence]]  # frame, t and what it showed, oldest first
@@ -57,6 +58,8 @@ def trace(
         outside = not np.all((pixels.max(axis=0) > 0) & (pixels.min(axis=0) < camera.image_size))
         if outside or not scale < settings.life.max_scale or last_seen - t > LOST_S:
             break
+        if len(samples) == PROOF and sum(sample.measured for sample in samples) < PROVEN * PROOF:
+            return [], np.zeros((0, 3))
         spread = np.sqrt(np.trace(J[0, :, :2] @ expected.prior.cov[:2, :2] @ J[0, :, :2].T))
         look = evidence.probe(pose, size, np.clip(3 * spread, *REACH_PX)[None], taken_at(frame))
         fit = measure.fit_poses(camera, look.outlines, pose, size, guess.size_sigma, settings.pose)

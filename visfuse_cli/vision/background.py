@@ -2,23 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from visfuse_cli.records import Array, Image
 from visfuse_cli.vision.ghosts import find_ghosts
 from visfuse_cli.vision.kalman_background import KalmanBackground
 
 FOREGROUND, SHADOW = 255, 127
-BLOCK = 4  # px: side of the places in which the empty scene is sought
-ALIKE = 6  # grey levels a channel between two sights of the same place
-SURE = 0.5  # share of the pictures that show what is the scene without doubt
-UNLIKE = 20.0  # grey levels from the surroundings that make a colour e times less likely
-AROUND, NEAR = (24.0, 6.0), 0.2  # blocks that surroundings reach, wide and near, and the share of them that is enough
 NOISE = 3.0  # grey levels a channel, of what a picture and its background may differ by where a ghost was
 STILL_S = 1.0  # s that a ghost stands before it is looked for
 KNN_FIRST, KNN_LOOKING = (0.5,) * 10, 1e-9  # rates: it fills its samples one by one, and divides by the logarithm
@@ -111,61 +105,3 @@ class Background:
                 cv2.copyTo(image, gone, self._picture)
                 self._corrected = gone if self._corrected is None else cv2.bitwise_or(self._corrected, gone)
         self._compared = t, grey, self._labels
-
-
-def empty_picture(images: Sequence[Image]) -> Image:
-    """The scene without its traffic, from pictures (H, W, 3) in the order of time.
-
-    In each small block the empty scene is the colour that is seen often and over the longest time; where no colour is
-    seen in half of the pictures, one like the surroundings is preferred: windows and tyres come back as well. The
-    picture is the mean of those that show it.
-    """
-    high, wide = images[0].shape[:2]
-    coarse = (-(-wide // BLOCK), -(-high // BLOCK))
-    blocks = np.stack([cv2.resize(image, coarse, interpolation=cv2.INTER_AREA) for image in images])
-    shows = _recurring(blocks, np.ones(blocks.shape[:3], np.float32))
-    often = shows.sum(axis=0)
-    colour = np.einsum("nvu,nvuc->vuc", shows.astype(np.float32), blocks.astype(np.float32)) / often[..., None]
-    sure = often >= SURE * len(images)
-    if not sure.all():
-        around = _surroundings(colour, sure.astype(np.float32))[~sure]
-        unsure = blocks[:, ~sure][:, None]
-        likely = np.exp(-np.abs(unsure - around).max(axis=-1) / UNLIKE)
-        shows[:, ~sure] = _recurring(unsure, likely)[:, 0]
-    total, count = np.zeros((high, wide, 3), np.float32), np.zeros((high, wide), np.float32)
-    for image, shown in zip(images, shows, strict=True):
-        mask = cv2.resize(shown.astype(np.uint8), (wide, high), interpolation=cv2.INTER_NEAREST)
-        cv2.accumulate(image, total, mask)
-        count += mask
-    return np.asarray(np.rint(total / count[..., None]), dtype=np.uint8)
-
-
-def _recurring(blocks: Image, likely: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """Which of n pictures of blocks (n, h, w, 3) show the colour that comes back over the longest time.
-
-    `likely` (n, h, w) is how likely each colour is to be the scene's before that.
-    """
-    count, high, wide, _ = blocks.shape
-    channels = np.ascontiguousarray(blocks.reshape(count, -1, 3).transpose(2, 0, 1))
-    best, shows = np.zeros(high * wide, np.float32), np.zeros((count, high * wide), bool)
-    for tried in range(count):
-        apart = np.zeros(shows.shape, np.uint8)
-        for channel in channels:
-            np.maximum(apart, cv2.absdiff(channel, np.broadcast_to(channel[tried], channel.shape)), out=apart)
-        alike = apart <= ALIKE
-        span = count - alike[::-1].argmax(axis=0) - alike.argmax(axis=0)
-        value = alike.sum(axis=0) * span * likely[tried].ravel()
-        better = value > best
-        best[better], shows[:, better] = value[better], alike[:, better]
-    return shows.reshape(count, high, wide)
-
-
-def _surroundings(colour: Array, sure: NDArray[np.float32]) -> Array:
-    """The colour (h, w, 3) of the sure blocks (h, w) about each one, from further away where none is near."""
-    found = colour
-    for reach in AROUND:
-        weight = cv2.GaussianBlur(sure, (0, 0), reach)[..., None]
-        here = cv2.GaussianBlur(colour * sure[..., None], (0, 0), reach) / np.maximum(weight, 1e-6)
-        near = np.clip(weight / NEAR, 0, 1)
-        found = here if reach == AROUND[0] else near * here + (1 - near) * found
-    return np.asarray(found, dtype=float)

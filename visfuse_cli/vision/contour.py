@@ -28,6 +28,7 @@ SOLID = 0.8  # of what lies inside a border must be paint to take what lies outs
 GROUND_EDGES = 4  # the first of the EDGES lie on the ground
 OPEN = 0.7  # of a profile that must be visible to expect a border in it
 LEAST = 0.1  # of a border or an area that must be visible to say anything about it
+OUTSIDE, OUTSIDE_PX = 0.06, (2.5, 10.0)  # of a silhouette's width, px: what lies so far outside of it is around it
 _RADII = np.sqrt((np.arange(5) + 0.5) / 5)  # from the middle of a silhouette to its border: equal areas
 
 
@@ -54,14 +55,17 @@ def hull_of(camera: GroundCamera, pixels: Array) -> np.ndarray:
 class Look:
     """What was seen of N boxes, as shares (N,) of what nothing hides; NaN where nearly everything is hidden.
 
-    border: of the border, what was found; clear: of the found border, what has background outside and not shadow or
-    paint; moved: of the area, what differs from the background; paint: of the area, what differs and is no shadow;
+    border: of the border, what was found; likeness: the same, of what does not lie in the midst of paint; clear: of
+    the found border, what has background outside and not shadow or paint; foot: of the border on the ground, what was
+    found; moved: of the area, what differs from the background; paint: of the area, what differs and is no shadow;
     open: of the area, what is in view.
     """
 
     outlines: Outlines
     border: Array
+    likeness: Array
     clear: Array
+    foot: Array
     moved: Array
     paint: Array
     open: Array
@@ -79,6 +83,82 @@ def search(
     (N,) is what the boxes are called there, 0 when they are not.
     """
     count = len(pose)
+    middle, at, normal, edge, share, total = _places(camera, pose, size)
+    offset = reach[:, None] * np.linspace(-1, 1, 2 * STEPS + 1)  # (N, S)
+    along = at[:, :, None] + normal[:, :, None] * offset[:, None, :, None]  # (N, K, S, 2)
+    label, whose, inside = _look(labels, owner, camera, along)
+    known = inside & ((whose == 0) | (whose == code[:, None, None]))
+    found = np.full((2, *share.shape), np.nan)
+    for k, moved in enumerate((label == FOREGROUND, label > 0)):  # shadow is outside, or it is grey paint
+        found[k] = _border(np.where(known, 2 * moved - 1, UNKNOWN), offset)
+    nearest = np.where(np.abs(found[1]) < np.abs(np.nan_to_num(found[0], nan=np.inf)), found[1], found[0])
+    ground = edge < GROUND_EDGES
+    under = _stands_in_shadow(label, known, offset, found, ground)
+    nearest = np.where(under, found[0], nearest)
+    valid = np.isfinite(nearest)
+    support = np.sum(normal * at, axis=-1) + np.nan_to_num(nearest)
+    outlines = Outlines(normal, support, EDGES[edge], share, valid, np.zeros(count, dtype=bool), total / np.pi)
+
+    in_view = known.mean(axis=2) > OPEN
+    told = in_view & (valid | ~_amidst(label, known))
+    label, whose, inside = _look(labels, owner, camera, _spokes(middle, at, _RADII))
+    own = inside & (whose == code[:, None, None])
+    area = _areas(middle, at, normal)[..., None] * np.ones(len(_RADII))
+    area /= np.maximum(area.sum(axis=(1, 2), keepdims=True), 1e-9)
+    clear = valid & (under | (np.abs(found[1] - nearest) < CLEAR_PX))
+    return Look(
+        outlines,
+        border=_share(valid & in_view, in_view, 1 / DIRECTIONS),
+        likeness=_share(valid & in_view, told, 1 / DIRECTIONS),
+        clear=_share(clear, valid, 1 / DIRECTIONS),
+        foot=_share(valid & in_view & ground, in_view & ground, 1 / DIRECTIONS),
+        moved=_share(own & (label > 0), own, area),
+        paint=_share(own & (label == FOREGROUND), own, area),
+        open=np.sum(own * area, axis=(1, 2)),
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class Fill:
+    """A quick look at N boxes (N,): px^2 of the silhouette; shares of it that are in view and free, that differ there
+    from the background and that are paint; and share of what lies just outside that is background or shadow."""
+
+    area: Array
+    open: Array
+    moved: Array
+    paint: Array
+    clear: Array
+
+
+def fill(labels: Labels, owner: Image, camera: GroundCamera, pose: Array, size: Array) -> Fill:
+    """What N boxes with pose (N, 3) and size (N, 3) are filled with, among those that `owner` (H, W) holds."""
+    middle, at, normal, _, _, total = _places(camera, pose, size)
+    label, whose, inside = _look(labels, owner, camera, _spokes(middle, at[:, ::2], _RADII[1::2]))
+    free = inside & (whose == 0)
+    area = _areas(middle, at, normal)
+    weight = area[:, ::2, None] * free
+    whole = np.maximum(weight.sum(axis=(1, 2)), 1e-9)
+    off = np.clip(OUTSIDE * total / np.pi, *OUTSIDE_PX)
+    around, whose, inside = _look(labels, owner, camera, at + off[:, None, None] * normal)
+    told = inside & (whose == 0)
+    # half of what a place's border length times its distance from the middle sums up to
+    return Fill(
+        area=area.sum(axis=1) * total / DIRECTIONS / 2,
+        open=free.mean(axis=(1, 2)),
+        moved=np.sum(weight * (label > 0), axis=(1, 2)) / whole,
+        paint=np.sum(weight * (label == FOREGROUND), axis=(1, 2)) / whole,
+        clear=np.sum(told & (around != FOREGROUND), axis=1) / np.maximum(told.sum(axis=1), 1),
+    )
+
+
+def _places(
+    camera: GroundCamera, pose: Array, size: Array
+) -> tuple[Array, Array, Array, NDArray[np.intp], Array, Array]:
+    """Middle (N, 1, 2) px of each silhouette, and K places spread evenly along its border.
+
+    at (N, K, 2) px and outward normal (N, K, 2) of the places, which of the EDGES (N, K) each lies on and how far along
+    it (N, K), and the border's length (N,) px.
+    """
     pixels, _ = project(camera, corners(pose, size))
     pixels = np.nan_to_num(pixels, nan=-1e4)
     ends = pixels[:, EDGES]  # (N, 12, 2, 2)
@@ -86,46 +166,27 @@ def search(
     total = np.cumsum(length, axis=1)
     places = (np.arange(DIRECTIONS) + 0.5) / DIRECTIONS * total[:, -1:]
     edge = np.minimum(np.sum(places[:, :, None] > total[:, None], axis=2), len(EDGES) - 1)  # (N, K)
-    rows = np.arange(count)[:, None]
+    rows = np.arange(len(pose))[:, None]
     share = (places - total[rows, edge]) / np.maximum(length[rows, edge], 1e-9) + 1
     share = np.clip(share, 0, 1)
     a, b = ends[rows, edge, 0], ends[rows, edge, 1]
     at = a + share[..., None] * (b - a)
     normal = np.stack([b[..., 1] - a[..., 1], a[..., 0] - b[..., 0]], axis=-1)
     normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-9)
-    inward = np.sum(normal * (at - pixels.mean(axis=1)[:, None]), axis=-1) < 0
-    normal[inward] *= -1
-
-    offset = reach[:, None] * np.linspace(-1, 1, 2 * STEPS + 1)  # (N, S)
-    along = at[:, :, None] + normal[:, :, None] * offset[:, None, :, None]  # (N, K, S, 2)
-    label, whose, inside = _look(labels, owner, camera, along)
-    known = inside & ((whose == 0) | (whose == code[:, None, None]))
-    found = np.full((2, *places.shape), np.nan)
-    for k, moved in enumerate((label == FOREGROUND, label > 0)):  # shadow is outside, or it is grey paint
-        found[k] = _border(np.where(known, 2 * moved - 1, UNKNOWN), offset)
-    nearest = np.where(np.abs(found[1]) < np.abs(np.nan_to_num(found[0], nan=np.inf)), found[1], found[0])
-    under = _stands_in_shadow(label, known, offset, found, edge < GROUND_EDGES)
-    nearest = np.where(under, found[0], nearest)
-    valid = np.isfinite(nearest)
-    support = np.sum(normal * at, axis=-1) + np.nan_to_num(nearest)
-    outlines = Outlines(normal, support, EDGES[edge], share, valid, np.zeros(count, dtype=bool), total[:, -1] / np.pi)
-
-    in_view = known.mean(axis=2) > OPEN
     middle = pixels.mean(axis=1)[:, None]
-    spokes = middle[..., None, :] + _RADII[:, None] * (at - middle)[:, :, None]  # (N, K, 5, 2)
-    label, whose, inside = _look(labels, owner, camera, spokes)
-    own = inside & (whose == code[:, None, None])
-    area = np.abs(np.sum(normal * (at - middle), axis=-1))[..., None] * np.ones(len(_RADII))
-    area /= np.maximum(area.sum(axis=(1, 2), keepdims=True), 1e-9)
-    clear = valid & (under | (np.abs(found[1] - nearest) < CLEAR_PX))
-    return Look(
-        outlines,
-        border=_share(valid & in_view, in_view, 1 / DIRECTIONS),
-        clear=_share(clear, valid, 1 / DIRECTIONS),
-        moved=_share(own & (label > 0), own, area),
-        paint=_share(own & (label == FOREGROUND), own, area),
-        open=np.sum(own * area, axis=(1, 2)),
-    )
+    inward = np.sum(normal * (at - middle), axis=-1) < 0
+    normal[inward] *= -1
+    return middle, at, normal, edge, share, total[:, -1]
+
+
+def _spokes(middle: Array, at: Array, radii: Array) -> Array:
+    """Points (N, K, R, 2) px between the middle (0) and the border (1)."""
+    return middle[..., None, :] + radii[:, None] * (at - middle)[:, :, None]
+
+
+def _areas(middle: Array, at: Array, normal: Array) -> Array:
+    """Distance (N, K) px from the middle to each place's edge: its share of the area."""
+    return np.abs(np.sum(normal * (at - middle), axis=-1))
 
 
 def _stands_in_shadow(
@@ -139,6 +200,11 @@ def _stands_in_shadow(
     inside = known & both[..., None] & (offset[:, None] < np.nan_to_num(found[0])[..., None])
     solid = np.sum(inside & (label == FOREGROUND), axis=(1, 2)) > SOLID * np.sum(inside, axis=(1, 2))
     return np.asarray(both & solid[:, None])
+
+
+def _amidst(label: np.ndarray, known: np.ndarray) -> NDArray[np.bool_]:
+    """Which profiles (N, K) show nothing but paint: another vehicle is beside this one."""
+    return np.asarray(np.sum(known & (label == FOREGROUND), axis=2) > SOLID * np.sum(known, axis=2))
 
 
 def _share(part: np.ndarray, whole: np.ndarray, weight: Array | float) -> Array:

@@ -1,0 +1,103 @@
+"""The scene without its traffic, from pictures of it with traffic."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from visfuse_cli.records import Array, Image
+
+BLOCK = 4  # px: side of the places in which the empty scene is sought
+ALIKE = 6  # grey levels a channel between two sights of the same place
+SURE = 0.5  # share of the pictures that show what is the scene without doubt
+UNLIKE = 20.0  # grey levels from the surroundings that make a colour e times less likely
+AROUND, NEAR = (24.0, 6.0), 0.2  # blocks that surroundings reach, wide and near, and the share of them that is enough
+LIT, SAME_HUE = (
+    (1.2, 2.4),
+    12.0,
+)  # times as bright as its shadow is the lit ground, and grey levels of its colour off that
+SAME_RATIO = 0.05  # of that ratio's logarithm
+LIT_SHARE = 0.06  # of the pictures in which a place is that much brighter, to take what is seen more often for shadow
+
+
+def empty_picture(images: Sequence[Image]) -> Image:
+    """The scene without its traffic, from pictures (H, W, 3) in the order of time.
+
+    In each small block the empty scene is the colour that is seen often and over the longest time; where no colour is
+    seen in half of the pictures, or where it may be a shadow's, one like the surroundings is preferred: windows and
+    tyres come back as well, and a queue casts its shadow for long. The picture is the mean of those that show it.
+    """
+    high, wide = images[0].shape[:2]
+    coarse = (-(-wide // BLOCK), -(-high // BLOCK))
+    blocks = np.stack([cv2.resize(image, coarse, interpolation=cv2.INTER_AREA) for image in images])
+    shows = _recurring(blocks, np.ones(blocks.shape[:3], np.float32))
+    often = shows.sum(axis=0)
+    colour = np.einsum("nvu,nvuc->vuc", shows.astype(np.float32), blocks.astype(np.float32)) / often[..., None]
+    lit = _lit(blocks, colour)
+    in_shadow = np.count_nonzero(lit, axis=0) >= max(2, LIT_SHARE * len(images))
+    sure = (often >= SURE * len(images)) & ~in_shadow
+    if not sure.all():
+        around = _surroundings(colour, sure.astype(np.float32))
+        off = np.abs(blocks - around.astype(np.float32)).max(axis=-1)
+        unsure = blocks[:, ~sure][:, None]
+        shows[:, ~sure] = _recurring(unsure, np.exp(-off[:, ~sure][:, None] / UNLIKE))[:, 0]
+        dark_off = np.abs(colour - around).max(axis=-1)
+        lit_off = np.where(lit, off, 0).sum(axis=0) / np.maximum(lit.sum(axis=0), 1)
+        better = in_shadow & (lit_off < dark_off + UNLIKE)
+        shows[:, better] = lit[:, better]
+    total, count = np.zeros((high, wide, 3), np.float32), np.zeros((high, wide), np.float32)
+    for image, shown in zip(images, shows, strict=True):
+        mask = cv2.resize(shown.astype(np.uint8), (wide, high), interpolation=cv2.INTER_NEAREST)
+        cv2.accumulate(image, total, mask)
+        count += mask
+    return np.asarray(np.rint(total / count[..., None]), dtype=np.uint8)
+
+
+def _recurring(blocks: Image, likely: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """Which of n pictures of blocks (n, h, w, 3) show the colour that comes back over the longest time.
+
+    `likely` (n, h, w) is how likely each colour is to be the scene's before that.
+    """
+    count, high, wide, _ = blocks.shape
+    channels = np.ascontiguousarray(blocks.reshape(count, -1, 3).transpose(2, 0, 1))
+    best, shows = np.zeros(high * wide, np.float32), np.zeros((count, high * wide), bool)
+    for tried in range(count):
+        apart = np.zeros(shows.shape, np.uint8)
+        for channel in channels:
+            np.maximum(apart, cv2.absdiff(channel, np.broadcast_to(channel[tried], channel.shape)), out=apart)
+        alike = apart <= ALIKE
+        span = count - alike[::-1].argmax(axis=0) - alike.argmax(axis=0)
+        value = alike.sum(axis=0) * span * likely[tried].ravel()
+        better = value > best
+        best[better], shows[:, better] = value[better], alike[:, better]
+    return shows.reshape(count, high, wide)
+
+
+def _lit(blocks: Image, colour: Array) -> NDArray[np.bool_]:
+    """Which blocks (n, h, w, 3) are as much brighter than a colour (h, w, 3) as the light is than its shadow.
+
+    How much that is, is the same everywhere under one sun, and not known before: it is what is seen most often.
+    """
+    length = np.maximum(np.sum(colour**2, axis=-1), 1.0)
+    ratio = np.einsum("nvuc,vuc->nvu", blocks, colour) / length
+    off = np.abs(blocks - ratio[..., None] * colour).max(axis=-1)
+    brighter = (ratio > LIT[0]) & (ratio < LIT[1]) & (off < SAME_HUE)
+    if not brighter.any():
+        return brighter
+    count, edges = np.histogram(np.log(ratio[brighter]), bins=int(np.log(LIT[1] / LIT[0]) / SAME_RATIO))
+    usual = np.log(ratio) - (edges[np.argmax(count)] + edges[np.argmax(count) + 1]) / 2
+    return np.asarray(brighter & (np.abs(usual) < 1.5 * SAME_RATIO))
+
+
+def _surroundings(colour: Array, sure: NDArray[np.float32]) -> Array:
+    """The colour (h, w, 3) of the sure blocks (h, w) about each one, from further away where none is near."""
+    found = colour
+    for reach in AROUND:
+        weight = cv2.GaussianBlur(sure, (0, 0), reach)[..., None]
+        here = cv2.GaussianBlur(colour * sure[..., None], (0, 0), reach) / np.maximum(weight, 1e-6)
+        near = np.clip(weight / NEAR, 0, 1)
+        found = here if reach == AROUND[0] else near * here + (1 - near) * found
+    return np.asarray(found, dtype=float)
