@@ -32,7 +32,7 @@ YOUNG, LEAP = 12, 4.0  # frames after which one measurement may not change the v
 SEEN_SHARE = 0.4  # of the unhidden area of a box that must have moved and of its border that must be found
 LIKENESS_S, UNLIKE = 0.4, 0.5  # s over which the share of the border that is found is averaged, and too little of it
 DOUBTFUL, MOVED_M = 0.25, 2.0  # share of the border that is not clear, to compare, and again so many m further
-WAIT_AT_MOST_S = 1.0  # before a doubtful track is compared again
+WAIT_AT_MOST_S = 4.0  # before a doubtful track is compared again
 KEPT = 0.9  # of its frames and of the outline seen in them a track keeps when its box is exchanged
 BETTER, MUCH_BETTER = 1.2, 2.0  # times as much must another box explain, and to be taken though seen for less time
 LOOK_BACK_FRAMES = 120  # at most
@@ -248,7 +248,8 @@ class GroundTracker:
         life, twins = self.settings.life, self._twins(pose, size)
         for k, track in enumerate(self.tracks):
             if k in twins:
-                ended.append(self._trimmed(track, f"same vehicle as track {twins[k].id}"))
+                reason = f"same vehicle as track {twins[k].id}" if track.samples[-1].measured else "lost"
+                ended.append(self._trimmed(track, reason))
             elif outside[k]:
                 ended.append(self._trimmed(track, "left the picture"))
             elif self._region is not None and self._left(track, self._region):

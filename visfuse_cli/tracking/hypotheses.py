@@ -26,7 +26,7 @@ ONE_PLACE = 0.25  # of a footprint that may lie in another's
 PART = 0.3  # how much more of these is wanted of a box that explains next to nothing
 SOLID, LARGE_M = 0.75, 3.0  # share of paint in, and length of, what may stand amidst shadows: no window is like it
 SHADOW_ONLY, UNMOVED = 0.3, 0.5  # what a pixel of shadow, and one that did not move, counts against one of paint
-SHARPER = 3  # a box over two vehicles explains twice as much, but half of its border is in neither's
+LARGER, SHARPER, CROSSING = 0.75, 3, 3  # weight of area, of border found, of border that lies in the midst of paint
 UNUSUAL = 3.0  # deviations of a size from its class
 USUAL_WEIGHT = 0.02  # a tenth less, roughly, for a box that is two deviations from its class in one measure
 HEADING_SIGMA = 0.12  # rad: the course of a region's foot
@@ -106,7 +106,8 @@ def gain_of(camera: GroundCamera, evidence: Evidence, pose: Array, size: Array, 
 
 def _gain(look: Look, area: Array) -> Array:
     filled = look.paint - SHADOW_ONLY * (look.moved - look.paint) - UNMOVED * (1 - look.moved)
-    return np.sqrt(area) * filled * look.border**SHARPER
+    amidst = look.border / np.maximum(look.likeness, 1e-9)  # 1 less the share of the border that lies in paint
+    return area**LARGER * filled * look.likeness**SHARPER * amidst**CROSSING
 
 
 def convincing(look: Look) -> NDArray[np.bool_]:

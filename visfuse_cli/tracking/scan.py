@@ -11,7 +11,7 @@ from visfuse_cli.maths.cameras import ground_scale, project
 from visfuse_cli.records import Array, GroundCamera
 from visfuse_cli.tracking import hypotheses, measure
 from visfuse_cli.tracking.evidence import Boxes, LabelEvidence
-from visfuse_cli.tracking.hypotheses import SHADOW_ONLY, UNMOVED, Guess
+from visfuse_cli.tracking.hypotheses import LARGER, SHADOW_ONLY, UNMOVED, Guess
 from visfuse_cli.tracking.settings import TrackerSettings
 from visfuse_cli.vision import wireframe
 from visfuse_cli.vision.points import Courses
@@ -94,7 +94,7 @@ def _filled(
         tried = np.column_stack([place, np.full(len(place), heading)])
         fill = evidence.fill(tried, np.tile(mean, (len(tried), 1)), taken)
         per_px = fill.paint - SHADOW_ONLY * (fill.moved - fill.paint) - UNMOVED * (1 - fill.moved)
-        value = np.sqrt(fill.area) * fill.open * per_px * fill.clear
+        value = fill.area**LARGER * fill.open * per_px * fill.clear
         good = (fill.clear > LEAST_CLEAR) & (fill.open > LEAST_OPEN) & (value > 0)
         which.append(np.full(np.count_nonzero(good), number))
         pose.append(tried[good])
