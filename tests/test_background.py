@@ -50,6 +50,18 @@ def test_the_road_is_found_under_traffic_that_covers_it_mostly(covered):
     assert np.abs(found.astype(int) - road()).max() <= 8
 
 
+def test_a_shadow_that_lies_there_most_of_the_time_is_no_part_of_the_scene():
+    rng = np.random.default_rng(4)
+    pictures = []
+    for k in range(40):
+        picture = road()
+        if k > 12:
+            picture[30:90, 40:120] = (picture[30:90, 40:120] * 0.55).astype(np.uint8)
+        pictures.append(noisy(picture, rng))
+    found = empty_picture(pictures)
+    assert np.mean(np.abs(found.astype(int) - road()) > 8) < 0.02
+
+
 def test_one_picture_is_its_own_background():
     np.testing.assert_array_equal(empty_picture([road()]), road())
 

@@ -28,7 +28,7 @@ SOLID, LARGE_M = 0.75, 3.0  # share of paint in, and length of, what may stand a
 SHADOW_ONLY, UNMOVED = 0.3, 0.5  # what a pixel of shadow, and one that did not move, counts against one of paint
 LARGER, SHARPER, CROSSING = 0.75, 3, 3  # weight of area, of border found, of border that lies in the midst of paint
 UNUSUAL = 3.0  # deviations of a size from its class
-USUAL_WEIGHT = 0.02  # a tenth less, roughly, for a box that is two deviations from its class in one measure
+USUAL_WEIGHT = 0.1  # a third less, roughly, for a box that is two deviations from its class in one measure
 HEADING_SIGMA = 0.12  # rad: the course of a region's foot
 
 
@@ -89,7 +89,11 @@ def refined(
     doubt = 1 - np.clip(area * look.moved / np.maximum(around_area, 1.0), 0, 1)
     clear = (look.border > BORDER_SEEN + PART * doubt) & (look.clear > CLEAR + PART * doubt)
     clear |= (look.border > BORDER_SEEN + PART / 2) & (look.paint > SOLID) & (mean[:, 0] > LARGE_M)
-    stands = ~(look.foot < FOOT_SEEN) & (look.open > OPEN) & (look.outlines.valid.mean(axis=1) > SHOWN)
+    stands = (
+        ~(look.foot < FOOT_SEEN)
+        & (look.open > OPEN)
+        & (look.outlines.tangent | (look.outlines.valid.mean(axis=1) > SHOWN))
+    )
     stands &= ~np.any(footprint_overlap(pose, size, *taken) > ONE_PLACE, axis=1)
     good = fit.ok & usual & measure.looks_right(fit, look.outlines) & clear & (look.moved > AREA_MOVED) & stands
     gain = _gain(look, area)

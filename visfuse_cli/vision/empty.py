@@ -88,7 +88,7 @@ def _lit(blocks: Image, colour: Array) -> NDArray[np.bool_]:
     if not brighter.any():
         return brighter
     count, edges = np.histogram(np.log(ratio[brighter]), bins=int(np.log(LIT[1] / LIT[0]) / SAME_RATIO))
-    usual = np.log(ratio) - (edges[np.argmax(count)] + edges[np.argmax(count) + 1]) / 2
+    usual = np.log(np.maximum(ratio, 1e-9)) - (edges[np.argmax(count)] + edges[np.argmax(count) + 1]) / 2
     return np.asarray(brighter & (np.abs(usual) < 1.5 * SAME_RATIO))
 
 

@@ -33,7 +33,7 @@ class Courses:
     velocity: Array
     course: Array
 
-    def __getitem__(self, which: object) -> Courses:
+    def __getitem__(self, which: NDArray[np.bool_]) -> Courses:
         return Courses(self.place[which], self.velocity[which], self.course[which])
 
 
