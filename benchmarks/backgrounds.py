@@ -25,7 +25,8 @@ from samples.files import write_scene
 from samples.render import frames
 from samples.road import free_flow
 from samples.scene import NEAREST_DEPTH, Scene
-from visfuse_cli.vision.background import FOREGROUND, Background, empty_picture
+from visfuse_cli.vision.background import FOREGROUND, Background
+from visfuse_cli.vision.empty import empty_picture
 
 MODELS = ("mog2", "knn", "kalman")
 SECONDS, ARTERIAL_S = 12.0, 24.0

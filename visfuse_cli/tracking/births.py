@@ -56,8 +56,9 @@ class Nursery:
         self._points = MovingPoints(camera)
 
     def watch(self, t: float, evidence: Evidence) -> None:
-        """Follow the corners of what moves."""
-        if isinstance(evidence, LabelEvidence) and (picture := evidence.picture()) is not None:
+        """Follow the corners of what moves; people turn and bend, so that theirs tell little."""
+        steers = self._settings.target.motion == "bicycle"
+        if steers and isinstance(evidence, LabelEvidence) and (picture := evidence.picture()) is not None:
             self._points.follow(picture, t, evidence.paint())
 
     def feed(self, frame: int, t: float, regions: list[Region]) -> None:
