@@ -82,16 +82,12 @@ class MovingRegions:
         labels = self._background.detect(frame.image)
         if self._watched is not None:
             labels = np.asarray(cv2.bitwise_and(labels, self._watched), dtype=np.uint8)
-<<<<<<< HEAD
         if self._sun.shadow is not None and len(expected[0]):
             where = shadow_picture(self._camera, *expected, self._sun.shadow.per_metre)
             labels = self._shade.cut(labels, frame.image, self._background.picture, where)
         self._labels = labels
-        return LabelEvidence(labels, self._camera, self._bands, *self._cleaning)
-=======
         grey = np.asarray(cv2.cvtColor(frame.image, cv2.COLOR_BGR2GRAY), dtype=np.uint8)
         return LabelEvidence(labels, self._camera, self._bands, *self._cleaning, grey)
->>>>>>> 1e25768 (speed: corners of vehicles are followed in the footage itself)
 
     def learn(self, frame: Frame, tracker: GroundTracker) -> None:
         pose, size = tracker.boxes()
