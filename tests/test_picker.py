@@ -10,6 +10,7 @@ from importlib import resources
 from pathlib import Path
 from urllib.parse import urlsplit
 
+import cv2
 import numpy as np
 import pytest
 
@@ -22,6 +23,7 @@ from visfuse_cli.files import homography
 from visfuse_cli.files.calibration_input import read_points
 from visfuse_cli.maths.layout import dashes, from_distances, rectangle
 from visfuse_cli.records import RunRequest
+from visfuse_cli.vision.corners import snap_line, snap_point
 
 SAMPLE = Path(str(resources.files("visfuse_cli.apps.sample")))
 
@@ -272,3 +274,54 @@ def test_in_a_browser_points_are_clicked_typed_judged_and_saved(tmp_path: Path):
     np.testing.assert_allclose(metres, world, atol=1e-4)
     assert np.abs(found - marks).max() < 5  # snapped, or as clicked
     assert homography.read(tmp_path / "H.json").image_size == (width, height)
+
+
+def stripe(ends: np.ndarray, width: float) -> np.ndarray:
+    """A bright stripe on dark asphalt, its middle line through ends (2, 2) px, every pixel antialiased."""
+    along = (ends[1] - ends[0]) / np.linalg.norm(ends[1] - ends[0])
+    side = np.array([-along[1], along[0]]) * width / 2
+    corners = np.stack([ends[0] + side, ends[0] - side, ends[1] - side, ends[1] + side])
+    large = np.full((240 * 8, 320 * 8), 70, np.uint8)
+    cv2.fillConvexPoly(large, np.round((corners + 0.5) * 8 - 0.5).astype(int), 190)
+    small = cv2.resize(large, (320, 240), interpolation=cv2.INTER_AREA).astype(float)
+    return np.clip(small + np.random.default_rng(0).normal(0, 2, small.shape), 0, 255).astype(np.uint8)
+
+
+def test_a_click_snaps_to_the_middle_of_a_dashs_end_or_to_its_corner():
+    ends, width = np.array([[150.3, 190.6], [170.2, 90.1]]), 7.0
+    image = stripe(ends, width)
+    along = (ends[1] - ends[0]) / np.linalg.norm(ends[1] - ends[0])
+    side = np.array([-along[1], along[0]]) * width / 2
+    for off in ([0.8, -0.7], [-0.5, 1.0], [0.0, 0.0]):
+        found = snap_point(image, ends[0] + off, 5.0)
+        assert found is not None
+        assert np.linalg.norm(found - ends[0]) < 0.4, off
+    corner = snap_point(image, ends[0] + side + [0.3, 0.4], 5.0)
+    assert corner is not None
+    assert np.linalg.norm(corner - ends[0] - side) < 0.6
+    assert snap_point(np.full((240, 320), 80, np.uint8), np.array([40.0, 60.0]), 5.0) is None
+
+
+def test_a_drawn_line_snaps_to_the_edge_under_it():
+    ends = np.array([[150.3, 190.6], [170.2, 90.1]])
+    image = stripe(ends, 30.0)
+    along = (ends[1] - ends[0]) / np.linalg.norm(ends[1] - ends[0])
+    side = np.array([-along[1], along[0]])
+    edge = ends[::-1] + 15 * side - np.outer([10, -10], along)
+    found = snap_line(image, (edge + 1.5 * side).ravel(), 6.0)
+    assert found is not None
+    assert np.abs((found.reshape(2, 2) - edge) @ side).max() < 0.3
+    assert snap_line(image, np.array([20.0, 20, 60, 25]), 5.0) is None
+
+
+def test_a_defect_costs_nothing_that_was_picked(desk: Desk, monkeypatch: pytest.MonkeyPatch, capsys):
+    def broken(asked: dict) -> dict:
+        raise ZeroDivisionError("oh")
+
+    monkeypatch.setattr(desk, "snap", broken)
+    with Server(desk) as server:
+        token = urlsplit(server.address).path
+        status, body = ask(server, "POST", token + "snap", {})
+        assert (status, json.loads(body)) == (500, {"reason": "internal error: oh"})
+        assert ask(server, "GET", token + "about")[0] == 200
+    assert "ZeroDivisionError" in capsys.readouterr().err

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 import secrets
+import sys
 import threading
+import traceback
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib import resources
@@ -91,6 +93,9 @@ def _handler(desk: Desk, token: str) -> type[BaseHTTPRequestHandler]:
                 self._json({"reason": str(problem)}, HTTPStatus.UNPROCESSABLE_ENTITY)
             except (BrokenPipeError, ConnectionResetError):
                 pass  # the page has gone
+            except Exception as problem:  # a defect must not cost what was picked so far
+                traceback.print_exc(file=sys.stderr)
+                self._json({"reason": f"internal error: {problem}"}, HTTPStatus.INTERNAL_SERVER_ERROR)
 
         def _admitted(self) -> str:
             """What is asked for, after the token; everything foreign is refused before it is looked at."""
