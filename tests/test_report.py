@@ -9,12 +9,14 @@ from html.parser import HTMLParser
 from importlib import resources
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from tests.chromium import page
 from visfuse_cli import report
 from visfuse_cli.errors import InputError
 from visfuse_cli.files.spool import TrackSpool
+from visfuse_cli.files.video_writer import VideoWriter, begin_of
 
 SAMPLE = Path(str(resources.files("visfuse_cli.apps.sample")))
 
@@ -177,6 +179,41 @@ def test_without_a_video_the_map_has_a_clock_of_its_own(tmp_path):
         window.click("text=Play")
         window.wait_for_function("parseFloat(document.querySelector('output').textContent) > 0.2")
         window.click("text=Pause")
+
+
+def test_a_video_that_begins_later_is_sought_by_the_footages_time(tmp_path):
+    """A run of --start 5: its video begins with its first picture, its tracks keep the footage's clock."""
+    _moving_run(tmp_path)
+    with VideoWriter(tmp_path / "annotated.mp4", 64, 48, 10) as video:
+        for k in range(30):
+            video.write(np.full((48, 64, 3), 8 * k, np.uint8), 5 + k / 10)
+    assert begin_of(tmp_path / "annotated.mp4") == 5
+    document = json.loads((tmp_path / "tracks.json").read_text())
+    for state in document["tracks"][0]["states"]:
+        state["t"] += 6.5
+    (tmp_path / "tracks.json").write_text(json.dumps(document))
+    report.write([tmp_path])
+    with page(1000, 800) as window:
+        window.goto((tmp_path / "report.html").as_uri())
+        window.wait_for_function("Math.abs(document.querySelector('video').duration - 3) < 0.2")
+        window.locator("tr[data-seek] button").first.click()
+        window.wait_for_function("Math.abs(document.querySelector('video').currentTime - 1.5) < 0.05")
+        window.wait_for_selector("tr.now")
+
+
+def test_a_calibration_has_a_page(run, tmp_path):
+    H = run.parent / "H.json"
+    done = _visfuse("report", H, run, "--out", tmp_path / "both.html")
+    assert done.returncode == 0, done.stderr
+    text = (tmp_path / "both.html").read_text(encoding="utf-8")
+    marks = len(json.loads(H.read_text())["residuals"])
+    assert f"{marks} of {marks}" in text
+    assert text.count("data:image/png") == 2
+    with page(390, 844) as window:
+        window.goto((tmp_path / "both.html").as_uri())
+        assert window.locator("section").first.locator("tbody tr").count() == marks
+        assert window.evaluate("document.documentElement.scrollWidth <= innerWidth")
+    assert report.write([H]) == H.with_suffix(".html")
 
 
 def test_what_is_no_run_is_refused(tmp_path):

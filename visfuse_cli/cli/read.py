@@ -19,7 +19,10 @@ FORMS = ("table", "csv", "json", "parquet")
 
 @app.command("report", short_help="One HTML page about one or several runs.")
 def report(
-    runs: Annotated[list[Path], typer.Argument(metavar="RUN...", help="Folders that tracking commands wrote.")],
+    runs: Annotated[
+        list[Path],
+        typer.Argument(metavar="RUN...", help="Folders that tracking commands wrote, and H.json of calibrations."),
+    ],
     out: Annotated[
         Path | None, typer.Option("--out", metavar="FILE", help="The page; default: report.html in the one RUN.")
     ] = None,

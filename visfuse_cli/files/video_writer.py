@@ -22,10 +22,14 @@ CLOCK = 90_000  # ticks a second
 KEYFRAME_S = 2  # how far a player jumps
 BT601, LIMITED = 6, 1  # AVColorSpace SMPTE170M, AVColorRange MPEG: what cv2's conversion makes
 
+BEGINS = "begins in the footage at "
+
 
 class VideoWriter:
     """`with VideoWriter(path, width, height) as video:` writes pictures (height, width, 3) BGR uint8 at their times.
 
+    The video begins with its first picture, since browsers misjudge the length of one that begins later; `begin_of`
+    tells when in the footage that was.
     The file appears under its name when the block ends, an interruption (KeyboardInterrupt) included; on any other
     exception, and without a single picture, there is none. An odd size grows by one pixel, repeated from the border.
     Raises OutputError where it cannot be written.
@@ -36,6 +40,7 @@ class VideoWriter:
         self.size = (height, width)
         self._rate = Fraction(rate).limit_denominator(1001)
         self._last = -1
+        self._first = 0
         self._closing = ExitStack()
 
     def __enter__(self) -> VideoWriter:
@@ -71,7 +76,10 @@ class VideoWriter:
             image = np.pad(image, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
         planes = np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2YUV_I420), np.uint8)
         frame = av.VideoFrame.from_ndarray(planes, format="yuv420p")
-        frame.pts, frame.time_base = pts, Fraction(1, CLOCK)
+        if self._last < 0:
+            self._first = pts
+            self._container.metadata["comment"] = f"{BEGINS}{pts / CLOCK:.6f} s"
+        frame.pts, frame.time_base = pts - self._first, Fraction(1, CLOCK)
         self._last = pts
         try:
             self._container.mux(self._stream.encode(frame))
@@ -100,3 +108,13 @@ class VideoWriter:
 
     def _refusal(self, problem: BaseException) -> OutputError:
         return OutputError(f"{self.path}: cannot be written: {getattr(problem, 'strerror', None) or problem}")
+
+
+def begin_of(path: Path) -> float:
+    """When in the footage (s) a written video begins; 0 where it does not say."""
+    try:
+        with av.open(f"file:{path}") as container:
+            comment = container.metadata.get("comment", "")
+    except (av.error.FFmpegError, OSError):
+        return 0.0
+    return float(comment.removeprefix(BEGINS).removesuffix(" s")) if comment.startswith(BEGINS) else 0.0

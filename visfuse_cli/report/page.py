@@ -15,8 +15,9 @@ from jinja2 import Environment, PackageLoader, select_autoescape
 
 from visfuse_cli import __version__
 from visfuse_cli.files.atomic import write_text
+from visfuse_cli.files.video_writer import begin_of
 from visfuse_cli.maths.consistency import innovations
-from visfuse_cli.report import plots, tables
+from visfuse_cli.report import calibration, plots, tables
 from visfuse_cli.report.folder import RunView, TrackView, read
 
 EMBEDDED_BYTES = 30_000_000  # of the videos of one run; what goes beyond is linked, beside the page
@@ -30,9 +31,12 @@ MEANING = {
 
 
 def write(folders: Sequence[Path], out: Path | None = None) -> Path:
-    """Write one page about runs, to their folder where it is one; raises InputError, OutputError."""
-    page = out or (folders[0] / NAME if len(folders) == 1 else Path(NAME))
-    runs = [_section(number, read(folder), page) for number, folder in enumerate(folders)]
+    """Write one page about runs and calibrations (H.json), beside the one there is; raises InputError, OutputError."""
+    page = out or _page_of(folders)
+    runs = [
+        _calibration(number, path) if path.is_file() else _section(number, read(path), page)
+        for number, path in enumerate(folders)
+    ]
     environment = Environment(
         loader=PackageLoader("visfuse_cli.report", "."),
         autoescape=select_autoescape(default=True),
@@ -46,6 +50,18 @@ def write(folders: Sequence[Path], out: Path | None = None) -> Path:
     )
     write_text(page, text)
     return page
+
+
+def _page_of(folders: Sequence[Path]) -> Path:
+    if len(folders) > 1:
+        return Path(NAME)
+    return folders[0].with_suffix(".html") if folders[0].is_file() else folders[0] / NAME
+
+
+def _calibration(number: int, path: Path) -> dict[str, Any]:
+    shown = calibration.section(path)
+    picture = _data_uri(shown["picture"], "image/png") if shown["picture"] else ""
+    return shown | {"key": f"run{number}", "document": {"command": "calibrate-homography"}, "calibration": picture}
 
 
 def _section(number: int, run: RunView, page: Path) -> dict[str, Any]:
@@ -95,7 +111,7 @@ def _consistency(tracks: list[TrackView]) -> list[str]:
     return found
 
 
-def _videos(run: RunView, page: Path) -> list[dict[str, str]]:
+def _videos(run: RunView, page: Path) -> list[dict[str, Any]]:
     """Each video in the page itself, as long as all of them stay small; else by a link."""
     videos, left = [], EMBEDDED_BYTES
     for name, path in run.videos.items():
@@ -104,7 +120,8 @@ def _videos(run: RunView, page: Path) -> list[dict[str, str]]:
         fits = size <= left
         left -= size if fits else 0
         source = _data_uri(path, "video/mp4") if fits else here
-        videos.append({"name": name, "source": source, "linked": "" if fits else here})
+        begin = begin_of(path)
+        videos.append({"name": name, "source": source, "linked": "" if fits else here, "begin": begin})
     return videos
 
 

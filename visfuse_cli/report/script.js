@@ -3,7 +3,7 @@
 const GRID = [0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50, 100, 200, 500], TRAIL_S = 3;
 const colour = id => `hsl(${((id * 0.61803398875) % 1) * 360} 65% 48%)`;
 
-for (const section of document.querySelectorAll("section")) {
+for (const section of document.querySelectorAll("section:has(script.tracks)")) {
   const { tracks, lanes } = JSON.parse(section.querySelector("script.tracks").textContent);
   const videos = [...section.querySelectorAll("video")], canvas = section.querySelector("canvas.map");
   const rows = [...section.querySelectorAll("tr[data-track]")], figures = [...section.querySelectorAll(".speeds")];
@@ -15,7 +15,9 @@ for (const section of document.querySelectorAll("section")) {
 
   const clipOf = video => several && video ? video.dataset.clip : null;
   const here = track => clipOf(shown) === null || track.clip === clipOf(shown);
-  const time = () => shown ? shown.currentTime : Number(slider.value);
+  const begin = video => Number(video.dataset.begin); // of a video, in the footage
+  const time = () => shown ? begin(shown) + shown.currentTime : Number(slider.value);
+  const seek = (video, t) => { video.currentTime = Math.max(0, t - begin(video)); };
   const points = [...tracks.flatMap(track => track.path.map(p => [p[1], p[2]])), ...lanes.flat()];
   const reach = axis => points.reduce((r, p) => [Math.min(r[0], p[axis]), Math.max(r[1], p[axis])], [Infinity, -Infinity]);
   const [left, right] = points.length ? reach(0) : [0, 1], [low, high] = points.length ? reach(1) : [0, 1];
@@ -79,7 +81,7 @@ for (const section of document.querySelectorAll("section")) {
   function show(video) {
     if (!video) return;
     for (const each of videos) { each.parentElement.hidden = each !== video; if (each !== video) each.pause(); }
-    if (!several && shown !== video) video.currentTime = shown.currentTime;
+    if (!several && shown !== video) seek(video, time());
     shown = video;
     draw();
   }
@@ -106,17 +108,18 @@ for (const section of document.querySelectorAll("section")) {
   for (const row of rows) row.addEventListener("click", () => {
     chosen = row.dataset.track === "" || Number(row.dataset.track) === chosen ? null : Number(row.dataset.track);
     const wanted = several ? videos.findIndex(video => video.dataset.clip === row.dataset.clip) : videos.indexOf(shown);
-    if (wanted >= 0) { show(videos[wanted]); if (menu) menu.value = wanted; shown.currentTime = Number(row.dataset.seek); }
+    if (wanted >= 0) { show(videos[wanted]); if (menu) menu.value = wanted; seek(shown, Number(row.dataset.seek)); }
     else if (!videos.length) { stop(); slider.value = row.dataset.seek; }
     draw();
   });
-  for (const table of section.querySelectorAll("table.sortable")) table.querySelectorAll("th").forEach((head, column) => head.querySelector("button").addEventListener("click", () => {
-    const down = head.getAttribute("aria-sort") === "ascending", body = table.tBodies[0];
-    table.querySelectorAll("th").forEach(each => each.removeAttribute("aria-sort")); head.setAttribute("aria-sort", down ? "descending" : "ascending");
-    const value = row => { const text = row.cells[column].textContent.trim(), number = parseFloat(text); return Number.isNaN(number) ? text : number; };
-    const order = (a, b) => { const x = value(a), y = value(b); return typeof x === typeof y ? (x < y ? -1 : x > y ? 1 : 0) : typeof x === "number" ? -1 : 1; };
-    [...body.rows].sort((a, b) => down ? order(b, a) : order(a, b)).forEach(row => body.append(row));
-  }));
   new ResizeObserver(draw).observe(canvas);
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", draw);
 }
+
+for (const table of document.querySelectorAll("table.sortable")) table.querySelectorAll("th").forEach((head, column) => head.querySelector("button").addEventListener("click", () => {
+  const down = head.getAttribute("aria-sort") === "ascending", body = table.tBodies[0];
+  table.querySelectorAll("th").forEach(each => each.removeAttribute("aria-sort")); head.setAttribute("aria-sort", down ? "descending" : "ascending");
+  const value = row => { const text = row.cells[column].textContent.trim(), number = parseFloat(text); return Number.isNaN(number) ? text : number; };
+  const order = (a, b) => { const x = value(a), y = value(b); return typeof x === typeof y ? (x < y ? -1 : x > y ? 1 : 0) : typeof x === "number" ? -1 : 1; };
+  [...body.rows].sort((a, b) => down ? order(b, a) : order(a, b)).forEach(row => body.append(row));
+}));
