@@ -82,7 +82,7 @@ class MovingRegions:
         labels = self._background.detect(frame.image)
         if self._watched is not None:
             labels = np.asarray(cv2.bitwise_and(labels, self._watched), dtype=np.uint8)
-        if self._sun.shadow is not None and len(expected[0]):
+        if self._sun.shadow is not None and self._shade.needed and len(expected[0]):
             where = shadow_picture(self._camera, *expected, self._sun.shadow.per_metre)
             labels = self._shade.cut(labels, frame.image, self._background.picture, where)
         self._labels = labels

@@ -121,4 +121,4 @@ class TrackerSettings(Section):
     @field_validator("region")
     @classmethod
     def _surrounds(cls, region: Polygon) -> Polygon:
-        return region and surrounding(region, "region")
+        return region and surrounding(region, "the polygon")

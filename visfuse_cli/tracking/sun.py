@@ -21,9 +21,11 @@ EVERY_S = 0.4  # between looks
 LEAST_PX = 400.0  # area of a silhouette that is worth a look
 STEP_M, AROUND_M = 0.55, 1.0  # grid of ground points around a vehicle, and how far it reaches beyond the longest shadow
 HIT, MISS = np.log(0.8 / 0.1), np.log(0.2 / 0.9)  # log odds of a ground point in a shadow that has changed, or not
+POINTS = 700  # about one vehicle, at most
 WORTH = 4.0  # log odds that one look at one vehicle is worth at most: its points are no independent witnesses
 VEHICLES, SURE = 4, 6.0  # vehicles, and log odds above those of no shadow, from which the sun is known
-SPREAD = 0.97  # length of the mean direction of what is likely: above, there is one direction
+TOLD = 0.17  # of what the looks are worth at most: reflections and the dark beneath vehicles tell less than shadows
+SPREAD = 0.96  # length of the mean direction of what is likely: above, there is one direction
 ENOUGH = 120  # looks after which the sun is known well
 DARKER = 0.92  # of the background: what is no darker is no shadow
 COLOUR = 14.0  # grey levels that a shadow may change the colour by
@@ -92,7 +94,8 @@ class Sun:
         seen = ((whole >= 0) & (whole < np.array(labels.shape[::-1]))).all(axis=1)
         local, whole = local[seen], whole[seen]
         free = owner[whole[:, 1], whole[:, 0]] == 0
-        local, whole = local[free], whole[free]
+        fewer = max(1, -(-np.count_nonzero(free) // POINTS))
+        local, whole = local[free][::fewer], whole[free][::fewer]
         changed = labels[whole[:, 1], whole[:, 0]] > 0
         fall = self._tried @ np.array([[c, -s], [s, c]])  # in the vehicle's axes
         shaded = _shaded(local, fall, half, float(size[2]))
@@ -104,7 +107,8 @@ class Sun:
         likely /= likely.sum()
         course = self._tried / np.linalg.norm(self._tried, axis=1, keepdims=True)
         agree = float(np.hypot(*(likely @ course)))
-        known = len(self._vehicles) >= VEHICLES and self._odds.max() > SURE and agree > SPREAD
+        sure = self._odds.max() > max(SURE, TOLD * WORTH * self._looks)
+        known = len(self._vehicles) >= VEHICLES and sure and agree > SPREAD
         self.shadow = Shadow(likely @ self._tried, len(self._vehicles)) if known else None
 
 
@@ -143,6 +147,11 @@ class Shade:
         self._ratio = ratio  # darkest that colour alone takes for shadow, as a share of the lit ground
         self._found: deque[float] = deque(maxlen=SAMPLES)
 
+    @property
+    def needed(self) -> bool:
+        """Whether colour alone does not tell shadows, or nobody knows yet."""
+        return len(self._found) < KNOWN or float(np.median(self._found)) <= CLEAR * self._ratio
+
     def cut(self, labels: Image, image: Image, empty: Image, where: Image) -> Image:
         """Labels with the foreground that is as dark as shadows are made shadow `where` one falls."""
         v, u = np.nonzero(cv2.bitwise_and(where, labels))
@@ -154,11 +163,9 @@ class Shade:
         darker = grey & (share < DARKER)
         if np.count_nonzero(darker) >= LEAST_DARK_PX:
             self._found.append(float(np.median(share[darker])))
-        if len(self._found) < KNOWN:
+        if len(self._found) < KNOWN or not self.needed:
             return labels
         usual = float(np.median(self._found))
-        if usual > CLEAR * self._ratio:
-            return labels
         shadow = darker & (np.abs(share - usual) < ALIKE * usual) & (labels[v, u] == FOREGROUND)
         cleaned = labels.copy()
         cleaned[v[shadow], u[shadow]] = SHADOW
