@@ -198,7 +198,8 @@ def _explain(model: type[Section], error: Any, where: str, origin: Mapping[Key, 
     known = location
     while known and known not in origin:
         known = known[:-1]
-    place = origin.get(known, where)
+    inside = next((place for key, place in origin.items() if key[: len(location)] == location), where)
+    place = origin.get(known, inside)
     dotted = ".".join(str(part) for part in location) or "the configuration"
     if error["type"] == "extra_forbidden":
         names = _keys_at(model, location[:-1])

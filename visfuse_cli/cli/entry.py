@@ -9,6 +9,7 @@ import signal
 import sys
 import tempfile
 import traceback
+import warnings
 from importlib import import_module
 from types import FrameType
 from typing import NoReturn
@@ -50,6 +51,8 @@ def main() -> None:
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")  # a path may hold bytes that no terminal can show
+    if not sys.warnoptions:
+        warnings.simplefilter("ignore")  # of libraries, about numbers that the results are checked for
     signal.signal(signal.SIGTERM, _terminate)
     try:
         code = app(standalone_mode=False)

@@ -20,10 +20,17 @@ DIGITS = 8  # of a degree: a millimetre
 def geojson(tracks: Tracks) -> str:
     """A FeatureCollection (RFC 7946), one LineString a track with the time of each vertex; raises as `placed` does."""
     code, lines = placed(tracks)
-    to_wgs84 = _library("pyproj").Transformer.from_crs(code, "EPSG:4326", always_xy=True)
+    pyproj = _library("pyproj")
+    try:
+        to_wgs84 = pyproj.Transformer.from_crs(code, "EPSG:4326", always_xy=True)
+    except pyproj.exceptions.CRSError as problem:
+        raise InputError(f"{tracks.folder / 'run.json'}: no coordinate reference '{code}' is known") from problem
     features = []
     for track, line in zip(tracks.tracks, lines, strict=True):
-        degrees = np.round(np.column_stack(to_wgs84.transform(line[:, 0], line[:, 1])), DIGITS).tolist()
+        places = np.column_stack(to_wgs84.transform(line[:, 0], line[:, 1]))
+        if not np.isfinite(places).all():
+            raise InputError(f"{tracks.folder / 'run.json'}: the origin lies nowhere in {code}")
+        degrees = np.round(places, DIGITS).tolist()
         kind, coordinates = ("LineString", degrees) if len(degrees) > 1 else ("Point", degrees[0])
         times = [state["t"] for state in track["states"]]
         features.append(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import operator
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -77,7 +78,7 @@ def table(tracks: Tracks) -> Iterator[dict[str, Any]]:
     for track in sorted(tracks.tracks, key=lambda each: (each.get("clip", ""), each["id"])):
         named = {
             "clip": track.get("clip"),
-            "track_id": int(track["id"]),
+            "track_id": operator.index(track["id"]),
             "class": track.get("class"),
             "rejected": track["summary"].get("rejected"),
         }
@@ -87,7 +88,8 @@ def table(tracks: Tracks) -> Iterator[dict[str, Any]]:
 
 def _row(state: dict[str, Any]) -> dict[str, Any]:
     size = len(state["position"])
-    row: dict[str, Any] = {name: state.get(name) for name in ("frame", "t", "speed", "speed_sigma", "measured")}
+    row: dict[str, Any] = {"frame": operator.index(state["frame"]), "measured": bool(state["measured"])}
+    row |= {name: state[name] + 0.0 for name in ("t", "speed", "speed_sigma")}  # a text is no number
     for axis, name in enumerate(AXES[:size]):
         row[name], row[f"v{name}"] = float(state["position"][axis]), float(state["velocity"][axis])
         row[f"sigma_{name}"] = math.sqrt(max(state["covariance"][axis][axis], 0.0))

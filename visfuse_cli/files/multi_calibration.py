@@ -16,6 +16,7 @@ from visfuse_cli.files.homography import COEFFICIENTS, is_camera_matrix
 from visfuse_cli.files.lens_files import LONGEST, NAMES, Size, lens_of, read_calibration_text, read_matrices
 from visfuse_cli.records import Array, Lens, View
 
+LARGEST = 1e9  # of any unit: what is beyond it was not measured
 FILE = "calibration.toml"
 KEYS = ("size", "matrix", "distortions", "rotation", "translation")
 POSES = (("R", "T"), ("rvec", "tvec"), ("rotation", "translation"), ("R", "t"))
@@ -85,6 +86,8 @@ def _numbers(where: str, table: Mapping[str, Any], key: str, shape: tuple[int, .
         raise InputError(f"{where}, {key}: must be {wanted} of numbers")
     if not np.isfinite(value).all():
         raise InputError(f"{where}, {key}: holds what is no finite number")
+    if value.size and np.abs(value).max() > LARGEST:
+        raise InputError(f"{where}, {key}: holds a number beyond {LARGEST:g}")
     return value
 
 
@@ -108,11 +111,11 @@ def _opencv_view(path: Path) -> View:
     if size is None:
         raise InputError(f"{path}: has no image_width and image_height")
     R, t = matrices[pose[0]], matrices[pose[1]].ravel()
-    if R.size == 3 and np.isfinite(R).all():
+    if R.size == 3 and (np.abs(R) <= LARGEST).all():
         R = cv2.Rodrigues(R.reshape(3, 1))[0]
     if not _is_rotation(R):
         raise InputError(f"{path}: {pose[0]} is no rotation: 3x3 with R R^T = 1 and determinant 1, or Rodrigues' three")
-    if t.size != 3 or not np.isfinite(t).all():
+    if t.size != 3 or not (np.abs(t) <= LARGEST).all():
         raise InputError(f"{path}: {pose[1]} must be three finite numbers, metres, x_camera = R x_world + T")
     U, _, Vt = np.linalg.svd(R)
     return View(path.stem, lens_of(path, matrices, *lens), _sized(size), U @ Vt, t)

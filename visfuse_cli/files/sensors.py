@@ -11,6 +11,7 @@ import numpy as np
 from visfuse_cli.errors import InputError
 from visfuse_cli.records import Array
 
+LARGEST = 1e9  # of any unit: what is beyond it was not measured
 FORMS = {
     "volts": ("t", "u1", "u2"),
     "wheels": ("t", "v1", "v2"),
@@ -82,6 +83,8 @@ def _values(path: Path, rows: list[list[str]], names: list[str]) -> Array:
                 ) from None
             if not np.isfinite(value):
                 raise InputError(f"{path}, line {number}, column {name}: {text.strip()} is not finite")
+            if abs(value) > LARGEST:
+                raise InputError(f"{path}, line {number}, column {name}: {text.strip()} is beyond {LARGEST:g}")
             numbers.append(value)
         values.append(numbers)
     return np.array(values, dtype=float).reshape(-1, len(names))

@@ -36,6 +36,8 @@ class WorldSettings(Section):
     @field_validator("ground")
     @classmethod
     def _plane(cls, plane: tuple[float, float, float, float]) -> tuple[float, float, float, float]:
+        if max(map(abs, plane)) > 1e9:
+            raise ValueError("holds a number beyond 1e9")
         if not sum(n * n for n in plane[:3]) > 1e-12:
             raise ValueError("a, b and c are all zero: that is no plane")
         return plane

@@ -15,6 +15,10 @@ from visfuse_cli.files.lanes_file import read_lanes
 from visfuse_cli.maths.polygons import Polygon
 from visfuse_cli.records import Array
 
+DOCUMENT = {"versions": dict, "config": dict, "time_audit": dict, "summary": dict, "inputs": list, "warnings": list}
+NEEDED = ("versions", "inputs")
+NUMBERS = ("track_id", "t_start", "t_end", "direction", "speed_kmh", "ci95_low_kmh", "ci95_high_kmh")
+
 
 @dataclass(frozen=True, slots=True)
 class TrackView:
@@ -51,10 +55,15 @@ def read(folder: Path) -> RunView:
     if not (folder / "run.json").is_file():
         raise InputError(f"{folder}: not a run folder: it has no run.json")
     document = _json(folder / "run.json")
+    for key, kind in DOCUMENT.items():
+        if not isinstance(document.get(key, kind()), kind) or (key in NEEDED and key not in document):
+            raise InputError(
+                f'{folder / "run.json"}: not the file of a run: "{key}" must be there, as a {kind.__name__}'
+            )
     tracks = _json(folder / "tracks.json") if (folder / "tracks.json").is_file() else {"tracks": []}
     try:
         views = [_track(track) for track in tracks["tracks"]]
-    except (KeyError, TypeError, ValueError) as problem:
+    except (KeyError, TypeError, ValueError, AttributeError) as problem:
         raise InputError(f"{folder / 'tracks.json'}: not the tracks of a run: {problem!r}") from problem
     picture = folder / "calibration.png"
     return RunView(
@@ -62,7 +71,7 @@ def read(folder: Path) -> RunView:
         document=document,
         frame_of_reference=str(tracks.get("frame_of_reference", "")),
         tracks=views,
-        rows=_table(folder / "speeds.csv"),
+        rows=_measured(folder / "speeds.csv"),
         rejected=_table(folder / "rejected.csv"),
         videos=_videos(folder),
         calibration=picture if picture.is_file() else None,
@@ -73,7 +82,7 @@ def read(folder: Path) -> RunView:
 def _json(path: Path) -> dict[str, Any]:
     try:
         document = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as problem:
+    except (OSError, ValueError, RecursionError) as problem:
         raise InputError(f"{path}: cannot be read: {problem}") from problem
     if not isinstance(document, dict):
         raise InputError(f"{path}: not the file of a run; it holds one JSON object")
@@ -90,9 +99,25 @@ def _table(path: Path) -> list[dict[str, str]]:
         raise InputError(f"{path}: cannot be read: {problem}") from problem
 
 
+def _measured(path: Path) -> list[dict[str, str]]:
+    """The rows of speeds.csv, their numbers tried."""
+    rows = _table(path)
+    for number, row in enumerate(rows, start=2):
+        for name in NUMBERS:
+            try:
+                good = np.isfinite(float(row[name]))
+            except (KeyError, TypeError, ValueError):
+                good = False
+            if not good:
+                raise InputError(f"{path}, line {number}, column {name}: {row.get(name)!r} is not a number")
+    return rows
+
+
 def _track(track: dict[str, Any]) -> TrackView:
     states = track["states"]
     column = lambda key, default: np.array([state.get(key, default) for state in states], dtype=float)  # noqa: E731
+    if not states or not isinstance(track["summary"], dict) or not np.isfinite(column("t", np.nan)).all():
+        raise ValueError(f"track {track['id']} has no states, times or summary")
     names = sorted({name for state in states for name in state.get("models", {})})
     return TrackView(
         id=int(track["id"]),
