@@ -67,9 +67,9 @@ def _moment(text: str | None, place: tzinfo, option: str) -> datetime | None:
         return None
     try:
         moment = datetime.fromisoformat(text)
-    except ValueError as problem:
+        return (moment if moment.tzinfo else moment.replace(tzinfo=place)).astimezone(UTC)
+    except (ValueError, OverflowError) as problem:
         raise UsageError(f"{option} {text}: not a time; write it like 2026-03-01 or 2026-03-01T06:30") from problem
-    return moment if moment.tzinfo else moment.replace(tzinfo=place)
 
 
 def _within(time_utc: str, begin: datetime | None, end: datetime | None) -> bool:

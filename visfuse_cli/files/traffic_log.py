@@ -7,6 +7,7 @@ import sqlite3
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,8 @@ WAIT_S = 60.0  # for another writer
 FIELDS = tuple(
     "track_id t_start t_end time_utc direction lane speed_kmh ci95_low_kmh ci95_high_kmh distance_m n_frames".split()
 )
+NUMBERS = frozenset(FIELDS) - {"time_utc"} | {"duration_s", "frames"}
+LARGEST = 1e9  # of any unit: what is beyond it was not measured
 MIGRATIONS = (  # from version i to i + 1
     """
     CREATE TABLE clips (
@@ -158,7 +161,21 @@ def read(path: Path) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
             base.close()
     except sqlite3.DatabaseError as problem:
         raise InputError(f"{path}: not a traffic log that can be read: {problem}") from problem
+    for row in (*clips, *vehicles):
+        if not _sound(row):
+            raise InputError(f"{path}: holds what no run has written: {dict(row)}")
     return [dict(row) for row in clips], [dict(row) for row in vehicles]
+
+
+def _sound(row: sqlite3.Row) -> bool:
+    """Whether a row holds numbers where numbers belong, and times with their offset."""
+    numbers = [row[name] for name in row.keys() if name in NUMBERS]  # noqa: SIM118  (a Row iterates over its values)
+    moment = row["time_utc"] if "time_utc" in row.keys() else row["began_utc"]  # noqa: SIM118
+    try:
+        aware = moment is None or datetime.fromisoformat(moment).tzinfo is not None
+        return aware and all(abs(number) <= LARGEST for number in numbers if number is not None)
+    except (TypeError, ValueError):
+        return False
 
 
 def _state(path: Path) -> tuple[int, int, int, int]:
