@@ -56,7 +56,7 @@ def read(path: Path) -> GroundMap:
     if not isinstance(document, dict) or document.get("schema") != SCHEMA:
         raise InputError(f'{path}: not a homography: "schema" must be "{SCHEMA}"')
     H = _array(path, document, "H", (3, 3))
-    if not 0.1 < np.abs(H).max() < LARGEST:
+    if H.any() and not 0.1 < np.abs(H).max() < LARGEST:
         raise InputError(f'{path}: "H" must be scaled to H[2][2] = 1; calibrate again')
     if np.linalg.cond(H / np.maximum(np.linalg.norm(H, axis=1, keepdims=True), 1e-300)) > 1e12:
         raise InputError(f'{path}: "H" is singular; calibrate again')
