@@ -248,8 +248,8 @@ class GroundTracker:
         life, twins = self.settings.life, self._twins(pose, size)
         for k, track in enumerate(self.tracks):
             if k in twins:
-                reason = f"same vehicle as track {twins[k].id}" if track.samples[-1].measured else "lost"
-                ended.append(self._trimmed(track, reason))
+                same = self._lived_together(track, twins[k])
+                ended.append(self._trimmed(track, f"same vehicle as track {twins[k].id}" if same else "lost"))
             elif outside[k]:
                 ended.append(self._trimmed(track, "left the picture"))
             elif self._region is not None and self._left(track, self._region):
@@ -283,6 +283,17 @@ class GroundTracker:
                 if other != k and int(other) not in found and worth[other] > worth[k]:
                     found[int(k)] = self.tracks[other]
         return found
+
+    def _lived_together(self, track: Track, other: Track) -> bool:
+        """Whether a track was in the other's place for most of its life; else it was hidden there in the end."""
+        index = {sample.frame: k for k, sample in enumerate(other.samples)}
+        common = [(k, index[sample.frame]) for k, sample in enumerate(track.samples) if sample.frame in index]
+        (pose, size), (place, its) = (
+            (np.array([self._pose_of(each.steps[k].posterior.mean) for k in rows]), np.tile(each.size, (len(rows), 1)))
+            for each, rows in zip((track, other), zip(*common, strict=True), strict=True)
+        )
+        shared = np.diagonal(footprint_overlap(pose, size, place, its)) > ONE_PLACE
+        return bool(np.count_nonzero(shared) > len(track.samples) / 2)
 
     def _trimmed(self, track: Track, reason: str) -> Track:
         """The track without the predictions after its last measurement."""

@@ -17,7 +17,7 @@ from visfuse_cli.tracking.conclude import Path
 Z95 = 1.959964
 SIZE_DOUBT = 0.03  # of a size: no vehicle is quite a box
 GOOD_ENOUGH, LONGER_FOR = 0.01, 1.5  # standard deviation of a speed over itself
-SHORT_S = 1.0  # s: a track that jumps sooner followed nothing
+DOUBTFUL_ENDS, SHORT_S = ("jumped", "no longer looks like itself"), 1.0  # s: a track that does so sooner is nothing
 JUMP_S = 0.3  # s a change of speed is looked at
 
 
@@ -30,7 +30,7 @@ class SpeedSettings(Section):
     max_sigma: float = Field(0.15, gt=0, le=10, description="standard deviation over speed: above, too uncertain")
     max_acceleration: float = Field(9.0, gt=0, le=100, description="m/s^2: above, the track has jumped")
     min_likeness: float = Field(
-        0.75, ge=0, le=1, description="least share of its outline that must be found, on average"
+        0.7, ge=0, le=1, description="least share of its outline that must be found, on average"
     )
     min_measured: float = Field(0.6, ge=0, le=1, description="share of a track's frames that must be measured")
     max_misfit: float = Field(0.2, gt=0, le=5, description="outline misfit over outline size: above, no such box")
@@ -130,8 +130,8 @@ def _reason(path: Path, verdict: Verdict, settings: SpeedSettings, trusted: bool
         return f"hardly moved: {verdict.distance:.1f} m"
     if path.measured.mean() < settings.min_measured:
         return f"seldom seen: measured in {100 * path.measured.mean():.0f} % of its frames"
-    if path.ended_by == "jumped" and path.t[-1] - path.t[0] < SHORT_S:
-        return f"jumped after {path.t[-1] - path.t[0]:.1f} s"
+    if path.ended_by in DOUBTFUL_ENDS and path.t[-1] - path.t[0] < SHORT_S:
+        return f"{path.ended_by} after {path.t[-1] - path.t[0]:.1f} s"
     if excess > settings.max_acceleration:
         return f"jump: speed changes by more than {excess:.0f} m/s^2"
     if refused > settings.max_refused:
