@@ -96,6 +96,19 @@ def _watched(motions: list[np.ndarray | None], fps: float = 25.0) -> CameraWatch
     return watch
 
 
+@pytest.mark.parametrize("knocked", [3, 8, 20])
+def test_a_knock_while_the_scene_is_learnt_does_not_move_where_the_camera_rests(knocked: int):
+    rng = np.random.default_rng(5)
+    pictures = [
+        _seen(_scene(), _turned(0, *(rng.normal(0, 0.8, 2) + ([9, -6] if k >= knocked else [0, 0]))), seed=k)
+        for k in range(22)
+    ]
+    laid = np.median(at_rest(pictures), axis=0).astype(np.uint8)
+    place = Steady(_seen(_scene(), np.eye(3))).register(laid)
+    assert place is not None
+    assert np.hypot(*place[:2, 2]) < 1.0
+
+
 def test_a_quiet_camera_is_left_alone():
     watch = _watched([np.eye(3)] * 60)
     assert watch.report() == {

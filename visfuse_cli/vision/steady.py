@@ -21,6 +21,7 @@ LEAST_AGREEING, LEAST_SHARE = 8, 0.15  # of the corners must agree; vehicles hid
 STILL_PX = 0.12  # less is left as it is: laying a picture back softens it
 FAR_PX = 5.0  # a larger turn of the camera is no similarity in the picture any more
 DARK = 16  # grey levels: a scene of which half is darker shows lamps and no corners
+SIDES, KNOCK_PX, KNOCK_SHAKES = 2, 3.0, 3.0  # pictures either side of a knock; px, and times the shake, that it moves
 COARSE_PX = 320  # width at which a knocked camera is found again
 
 
@@ -117,17 +118,35 @@ def moved(motion: Array, points: Array) -> Array:
 
 
 def at_rest(pictures: Iterable[Image]) -> list[Image]:
-    """Pictures (H, W, 3) of one camera, each as seen from the middle of the places where the camera was.
+    """Pictures (H, W, 3) of one camera, each as seen from the middle of the places where the camera was at first.
 
-    All are as bright as the first; one in which the scene cannot be found again is left out.
+    What follows a knock does not count. All are as bright as the first; one in which the scene cannot be found again is
+    left out.
     """
     waiting = list(pictures)
     steady, exposure = Steady(waiting[0]), Exposure(waiting[0])
     waiting = [levelled(picture, exposure.gain(picture)) for picture in waiting]
     motions = [steady.register(picture) for picture in waiting]
     found = [(picture, motion) for picture, motion in zip(waiting, motions, strict=True) if motion is not None]
-    rest = np.median([motion for _, motion in found], axis=0)
+    places = np.array([moved(motion, steady.middle) for _, motion in found])
+    rest = np.median([motion for _, motion in found[: _before_knocks(places)]], axis=0)
     return [steady.laid_back(picture, motion @ np.linalg.inv(rest)) for picture, motion in found]
+
+
+def _before_knocks(places: Array) -> int:
+    """How many of the places (n, 2) px, in the order of time, come before the camera was knocked for good."""
+    count = len(places)
+    while count >= 2 * SIDES:
+        within = []
+        for k in range(SIDES, count - SIDES + 1):
+            sides = places[:k], places[k:count]
+            within.append(sum(float(np.sum((side - np.median(side, axis=0)) ** 2)) for side in sides))
+        k = SIDES + int(np.argmin(within))
+        way = np.linalg.norm(np.median(places[k:count], axis=0) - np.median(places[:k], axis=0))
+        if way < max(KNOCK_PX, KNOCK_SHAKES * float(np.sqrt(min(within) / count))):
+            return count
+        count = k
+    return count
 
 
 def _turn(here: NDArray[np.float32], there: NDArray[np.float32], sharpness: Array) -> Array:
