@@ -1,4 +1,4 @@
-"""What a finished track was: its measurements filtered and smoothed along the path, and the speed they tell."""
+"""What a finished track was: all its sightings adjusted along the path, and the speed they tell."""
 
 from __future__ import annotations
 
@@ -6,24 +6,22 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from visfuse_cli.facing.target import LATERAL, VERTICAL, S, Shape, Target, V, drift, expected, middle
-from visfuse_cli.facing.target import shape_of as front_of
-from visfuse_cli.maths import gaussian
+from visfuse_cli.facing.adjust import ALONG, RIGHT, SPEED, UP, Adjusted, Rules, Sightings, adjust, slopes
+from visfuse_cli.facing.target import FACING, LATERAL, VERTICAL, S, Target, V, drift
 from visfuse_cli.maths.paths import Way, through
-from visfuse_cli.maths.planes import triangulated
-from visfuse_cli.maths.smoothing import Smoothed, cross_covariance, rauch_tung_striebel
-from visfuse_cli.records import Array, Gaussian, StereoRig
+from visfuse_cli.maths.planes import in_right, projected, triangulated
+from visfuse_cli.records import Array, Gaussian
 
 Z95 = 1.959963984540054
-ROUNDS = 3  # of linearisation
 SHOWN = 0.2  # of its own height, or of the logarithm of it: what a moving thing changes in the picture
 ALIKE = 0.8  # median correlation
-SHARED_S = 0.2  # s for which the patch errs alike: pictures nearer in time do not add to each other
-GRID = np.array([0.01, 0.03, 0.1, 0.25, 0.6, 1.5, 4.0])  # m/s a frame at 5 frames/s
-USUAL, SPREAD = 0.06, 1.2  # of the deviation of speed, and of its logarithm, before anything is known
-STEP = np.array([0.01, 0.01, 0.01, 0.01, 1e-4])  # of the numerical Jacobians
+USUAL_SIGMA, USUAL_RELIEF, USUAL_SPEED = 0.06, 0.1, 15.0
+FEWEST = 2  # pieces an instant: with fewer the whole patch stands for one
+STEP = 0.01  # m, of the numerical derivatives
 DRIFT_SPEED = 0.05  # m/s across the path
 PATH_SPEED_SHARE = 0.001  # of the speed: what the path's own direction may add
+PIXELS = ("left", "right", "left_cov", "across_cov")
+PLACE = [ALONG, RIGHT, UP]
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,12 +39,12 @@ class Settled:
     speed_sigma: Array
     measured: Array
     quads: list[dict[str, Array]]
-    corners: Array  # (T, 4, 3) m
     mean_speed: float
     mean_sigma: float
     distance: float
-    nis: float
+    noise: float
     sigma_v: float
+    relief: float
     way: Way
     ended_by: str
 
@@ -59,11 +57,30 @@ def conclude(target: Target) -> Settled | None:
     if not target.on_path and target.config.filter.path_constraint:
         target = _with_way(target)
     t = np.array([look.t for look in target.looks])
-    sigma_v, smoothed, nis = _best(target, t)
-    settled = _settled(target, t, smoothed, sigma_v, nis)
+    start = _start(target, t)
+    adjusted = adjust(
+        target.rig, target.way, _sightings(target, t), _rules(target, start), target.config.filter.sigma_v, start
+    )
+    settled = _settled(target, t, adjusted)
     if not target.given and not _moved(target, settled):
         return None
     return settled if target.config.smooth else _causal(target, settled)
+
+
+def _rules(target: Target, start: Array) -> Rules:
+    """What is known of the target before its sightings are looked at; what is slow drifts less."""
+    lateral, vertical = drift(target)
+    speed = abs(float(start[0, SPEED]))
+    most = target.config.filter.free_share * 0.2 * speed
+    return Rules(
+        lateral=max(min(lateral, most), 1e-5),
+        vertical=max(min(vertical, most / 2), 1e-5),
+        sigma_v=USUAL_SIGMA,
+        relief=USUAL_RELIEF,
+        height=float(np.ptp(target.shape.corners[:, 2])),
+        anchor=target.looks[0].quads["left"].mean(axis=0),
+        pace=float(np.clip(speed / USUAL_SPEED, 0.01, 1.0)),
+    )
 
 
 def _moved(target: Target, settled: Settled) -> bool:
@@ -85,183 +102,136 @@ def _with_way(target: Target) -> Target:
     spread = np.array([look.R[3, 3] + look.R[0, 0] - 2 * look.R[0, 3] for look in target.looks])
     sigma = points[:, 2] ** 2 / (rig.left.K[0, 0] * rig.baseline) * np.sqrt(spread + 0.05**2)
     way = through(points, sigma, 25.0)
-    first = target.looks[0]
-    shape, _ = front_of(rig, way, first.quads["left"], float(points[0, 2]))
-    return replace(target, way=way, shape=shape, on_path=True)
+    return replace(target, way=way, on_path=True)
 
 
-def _best(target: Target, t: Array) -> tuple[float, Smoothed, float]:
-    """The deviation of speed that explains the measurements best, and the smoothed states (T, 5) with it."""
-    asked = target.config.filter.sigma_v
-    if asked is not None:
-        smoothed, _, nis = _smoothed(target, t, asked)
-        return asked, smoothed, nis
-    score = []
-    for sigma in GRID:
-        _, likelihood, nis = _smoothed(target, t, float(sigma))
-        # Were the noise what the innovations say it is, this would be the likelihood.
-        freedom = len(_rows(target)) * max(len(t) - 2, 1)
-        if nis > 1:
-            likelihood += 0.5 * freedom * (nis - 1 - np.log(nis))
-        score.append(likelihood - 0.5 * (np.log(sigma / USUAL) / SPREAD) ** 2)
-    weight = np.exp(np.array(score) - max(score))
-    sigma = float(np.exp(np.sum(weight * np.log(GRID)) / weight.sum()))
-    smoothed, _, nis = _smoothed(target, t, sigma)
-    return sigma, smoothed, nis
+def _sightings(target: Target, t: Array) -> Sightings:
+    """All sightings of pieces that were seen more than once, in one row; of the whole patch where pieces are few."""
+    each = [look.seen for look in target.looks]
+    piece = np.concatenate([seen.pieces for seen in each]).astype(np.intp)
+    frame = np.repeat(np.arange(len(each)), [len(seen.pieces) for seen in each])
+    often = np.bincount(piece, minlength=1)[piece] > 1
+    if np.count_nonzero(often) < FEWEST * len(t):
+        return _whole(target, t)
+    _, piece = np.unique(piece[often], return_inverse=True)
+    pixels = [np.concatenate([getattr(seen, name) for seen in each])[often] for name in PIXELS]
+    return Sightings(t, frame[often], piece, *pixels)
 
 
-def _smoothed(target: Target, t: Array, sigma_v: float) -> tuple[Smoothed, float, float]:
-    """States (T, 5), log-likelihood, and NIS a degree of freedom: an extended filter and smoother, linearised anew."""
-    about = _start(target, t)
-    smoothed, likelihood, nis = _pass(target, t, sigma_v, about)
-    for _ in range(ROUNDS - 1):
-        smoothed, likelihood, nis = _pass(target, t, sigma_v, smoothed.mean)
-    return smoothed, likelihood, nis
+def _whole(target: Target, t: Array) -> Sightings:
+    """The whole patch as if it were one piece."""
+    z, R = (np.stack([getattr(look, name) for look in target.looks]) for name in ("z", "R"))
+    index = np.arange(len(t), dtype=np.intp)
+    return Sightings(t, index, 0 * index, z[:, :2], z[:, 3:], R[:, :2, :2], R[:, 3:, 3:] - R[:, :2, :2])
 
 
 def _start(target: Target, t: Array) -> Array:
-    """States (T, 5) of the measured places, roughly."""
+    """States (T, 4) of the measured places, roughly."""
     z = np.stack([look.z for look in target.looks])
     points = triangulated(target.rig, z[:, :2], z[:, 3:])
     s = np.array([target.way.nearest(point) for point in points])
-    state = np.zeros((len(t), 5))
-    state[:, S] = s
-    state[:, V] = np.polyfit(t - t[0], s, 1)[0] if len(t) > 1 else 0.0
     place, axes = target.way.frame(s)
     off = np.einsum("tab,ta->tb", axes, points - place)
-    state[:, LATERAL], state[:, VERTICAL] = off[:, 1], off[:, 2]
-    return state
+    speed = np.polyfit(t - t[0], s, 1)[0]
+    return np.column_stack([s, np.full(len(t), speed), off[:, 1:]])
 
 
-def _pass(target: Target, t: Array, sigma_v: float, about: Array) -> tuple[Smoothed, float, float]:
-    """One run forth and back, linearised about states (T, 5)."""
-    lateral, vertical = drift(target)
-    h, H = _expected(target.rig, target.way, target.shape, about)
-    prior = Gaussian(about[0].copy(), np.diag([30.0, 60.0, 5.0, 5.0, 0.5]) ** 2)
-    belief = prior
-    filtered, predicted, transitions = [], [], []
-    likelihood, nis, freedom = 0.0, 0.0, 0
-    shared = max(1.0, SHARED_S / float(np.median(np.diff(t)))) if len(t) > 1 else 1.0
-    for k, look in enumerate(target.looks):
-        dt = float(t[k] - t[k - 1]) if k else 0.0
-        F = np.eye(5)
-        F[S, V] = dt
-        Q = np.zeros((5, 5))
-        q = 5 * sigma_v**2
-        Q[np.ix_([S, V], [S, V])] = q * np.array([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]])
-        Q[LATERAL, LATERAL], Q[VERTICAL, VERTICAL] = 5 * dt * lateral**2, 5 * dt * vertical**2
-        Q += 1e-12 * np.eye(5)
-        ahead = gaussian.predict(belief, F, Q) if k else prior
-        rows = _rows(target)
-        residual = look.z - h[k] - H[k] @ (ahead.mean - about[k])
-        R = shared * look.R[np.ix_(rows, rows)]
-        belief, innovation = gaussian.update(ahead, residual[rows], H[k][rows], R)
-        if k > 1:
-            likelihood += float(innovation.log_likelihood)
-            nis, freedom = nis + float(innovation.nis), freedom + len(rows)
-        filtered.append(belief)
-        predicted.append(ahead)
-        transitions.append(F)
-    after, before = (
-        Gaussian(np.stack([b.mean for b in beliefs]), np.stack([b.cov for b in beliefs]))
-        for beliefs in (filtered, predicted)
-    )
-    return rauch_tung_striebel(after, before, np.stack(transitions)), likelihood, nis / max(freedom, 1)
-
-
-def _rows(target: Target) -> list[int]:
-    """Which components are used: with `triangulation`, for comparison, the two middles alone."""
-    return [0, 1, 3, 4] if target.config.filter.kind == "triangulation" else [0, 1, 2, 3, 4]
-
-
-def _expected(rig: StereoRig, way: Way, shape: Shape, states: Array) -> tuple[Array, Array]:
-    """What would be measured (T, 5) at states (T, 5), and the Jacobians (T, 5, 5), by central differences."""
-    tried = states[:, None, :] + np.concatenate([np.zeros((1, 5)), np.diag(STEP), -np.diag(STEP)])[None]
-    z = expected(rig, way, shape, tried)
-    H = (z[:, 1:6] - z[:, 6:11]) / (2 * STEP[None, :, None])
-    return z[:, 0], np.swapaxes(H, 1, 2)
-
-
-def _settled(target: Target, t: Array, smoothed: Smoothed, sigma_v: float, nis: float) -> Settled:
+def _settled(target: Target, t: Array, adjusted: Adjusted) -> Settled:
     """Positions, velocities and the mean speed, with what is not known of them."""
-    mean, cov = smoothed.mean, smoothed.cov
-    if nis > 1:  # the patch was not as flat, or its noise not as small, as was taken
-        cov = cov * nis
-    place = middle(target.way, mean)
-    J = _motion(target.way, mean)
-    velocity = J[:, :3, S] * mean[:, V, None]
-    full = np.zeros((len(t), 6, 5))
-    full[:, :3] = J
-    full[:, 3:, V] = J[:, :, S]
-    belief = Gaussian(np.concatenate([place, velocity], axis=1), _with_drift(full @ cov @ np.swapaxes(full, 1, 2), J))
-    stretch = np.linalg.norm(J[:, :, S], axis=1)  # beside a curved path the way is longer, or shorter
-    speed = np.abs(mean[:, V]) * stretch
-    distance = float(np.sum(np.linalg.norm(np.diff(place, axis=0), axis=1))) if len(t) > 1 else 0.0
-    way = abs(float(np.sum((stretch[1:] + stretch[:-1]) / 2 * np.diff(mean[:, S]))))
+    states, T = adjusted.states, len(t)
+    blocks = adjusted.cov.reshape(T, 4, T, 4)
+    each = np.arange(T)
+    aside = slopes(t, states[:, [RIGHT, UP]])
+    belief, stretch = _belief(target.way, states[:, PLACE], states[:, SPEED], aside, blocks[each, :, each, :])
+    steps = np.diff(states[:, PLACE], axis=0)
+    steps[:, 0] *= (stretch[1:] + stretch[:-1]) / 2
+    way = float(np.sum(np.linalg.norm(steps, axis=1)))
     duration = float(t[-1] - t[0])
-    cross = cross_covariance(smoothed, 0, len(t) - 1)[S, S] * (nis if nis > 1 else 1.0)
-    variance = (cov[0, S, S] + cov[-1, S, S] - 2 * cross) * float(np.mean(stretch)) ** 2
+    ends = blocks[[0, -1]][:, ALONG][:, [0, -1], ALONG] * float(np.mean(stretch)) ** 2
+    variance = float(np.array([-1.0, 1.0]) @ ends @ np.array([-1.0, 1.0]))
     mean_speed = way / duration
-    sigma = float(np.hypot(np.sqrt(max(variance, 0.0)) / duration, PATH_SPEED_SHARE * mean_speed))
     return Settled(
         id=target.id,
         frame=[look.frame for look in target.looks],
         t=t,
         belief=belief,
-        speed=speed,
-        speed_sigma=np.sqrt(cov[:, V, V]) * stretch,
-        measured=np.ones(len(t), dtype=bool),
-        quads=[look.quads for look in target.looks],
-        corners=target.shape.points(target.way, mean),
+        speed=np.linalg.norm(belief.mean[:, 3:], axis=1),
+        speed_sigma=np.sqrt(blocks[each, SPEED, each, SPEED]) * stretch,
+        measured=np.ones(T, dtype=bool),
+        quads=_carried(target, states[:, PLACE]) if target.given else [look.quads for look in target.looks],
         mean_speed=mean_speed,
-        mean_sigma=sigma,
-        distance=distance,
-        nis=nis,
-        sigma_v=sigma_v,
+        mean_sigma=float(np.hypot(np.sqrt(max(variance, 0.0)) / duration, PATH_SPEED_SHARE * mean_speed)),
+        distance=way,
+        noise=adjusted.noise,
+        sigma_v=adjusted.sigma_v,
+        relief=adjusted.relief,
         way=target.way,
         ended_by=target.ended_by,
     )
 
 
-def _with_drift(cov: Array, J: Array) -> Array:
-    """Covariances (T, 6, 6) with what is not known of the velocity across the path; J (T, 3, 5) as of `_motion`."""
-    cov = cov.copy()
-    along = J[:, :, S] / np.linalg.norm(J[:, :, S], axis=1, keepdims=True)
-    cov[:, 3:, 3:] += DRIFT_SPEED**2 * (np.eye(3) - along[:, :, None] * along[:, None, :])
-    return (cov + np.swapaxes(cov, 1, 2)) / 2
+def _carried(target: Target, place: Array) -> list[dict[str, Array]]:
+    """The first quad as the vehicle carries it, in both views; as it was seen first, so it is drawn always."""
+    rig, first = target.rig, target.looks[0].quads["left"]
+    point = _middle(target.way, place)
+    rays = np.column_stack([first, np.ones(4)]) @ np.linalg.inv(rig.left.K).T
+    axes = target.way.frame(place[:, 0])[1]
+    ahead = axes[0, :, 0] @ point[0] / np.linalg.norm(point[0])
+    normal = axes[0, :, 0] if abs(ahead) > FACING else np.array([0.0, 0.0, 1.0])
+    corners = (rays * (normal @ point[0] / (rays @ normal))[:, None] - point[0]) @ axes[0]
+    moved = point[:, None] + corners @ np.swapaxes(axes, 1, 2)
+    left, right = projected(rig.left.K, moved), projected(rig.right.K, in_right(rig, moved))
+    return [{"left": a, "right": b} for a, b in zip(left, right, strict=True)]
 
 
-def _motion(way: Way, states: Array) -> Array:
-    """d middle / d state (T, 3, 5)."""
-    tried = states[:, None, :] + np.concatenate([np.diag(STEP), -np.diag(STEP)])[None]
-    place = middle(way, tried)
-    return np.swapaxes((place[:, :5] - place[:, 5:]) / (2 * STEP[None, :, None]), 1, 2)
+def _belief(way: Way, place: Array, speed: Array, aside: Array, cov: Array) -> tuple[Gaussian, Array]:
+    """Position and velocity (T, 6) of places along, right and up (T, 3), speeds (T,) along and (T, 2) aside, and the
+    way's stretch (T,).
+
+    cov (T, 4, 4) is that of arc length, speed, drift right and up. Beside a curved path the way is longer, or shorter.
+    """
+    J = _motion(way, place)
+    full = np.zeros((len(place), 6, 4))
+    full[:, :3, PLACE] = J
+    full[:, 3:, SPEED] = J[:, :, 0]
+    stretch = np.linalg.norm(J[:, :, 0], axis=1)
+    along = J[:, :, 0] / stretch[:, None]
+    both = full @ cov @ np.swapaxes(full, 1, 2)
+    both[:, 3:, 3:] += DRIFT_SPEED**2 * (np.eye(3) - along[:, :, None] * along[:, None, :])
+    velocity = J[:, :, 0] * speed[:, None] + np.einsum("tab,tb->ta", J[:, :, 1:], aside)
+    mean = np.concatenate([_middle(way, place), velocity], axis=1)
+    return Gaussian(mean, (both + np.swapaxes(both, 1, 2)) / 2), stretch
+
+
+def _middle(way: Way, place: Array) -> Array:
+    """Points (..., 3) m of places (..., 3) along, right and up."""
+    point, axes = way.frame(place[..., 0])
+    return np.asarray(point + place[..., 1, None] * axes[..., 1] + place[..., 2, None] * axes[..., 2])
+
+
+def _motion(way: Way, place: Array) -> Array:
+    """d point / d place (T, 3, 3)."""
+    tried = place[:, None, :] + STEP * np.concatenate([np.eye(3), -np.eye(3)])[None]
+    point = _middle(way, tried)
+    return np.swapaxes((point[:, :3] - point[:, 3:]) / (2 * STEP), 1, 2)
 
 
 def _causal(target: Target, settled: Settled) -> Settled:
     """The particles' own output, instant by instant, in place of the smoothed states."""
     kept = [entry for entry in target.causal if entry[1] <= settled.t[-1] + 1e-9]
-    states = np.stack([belief.mean for _, _, belief, _ in kept])
-    cov = np.stack([belief.cov for _, _, belief, _ in kept])
-    t = np.array([entry[1] for entry in kept])
-    J = _motion(target.way, states)
-    full = np.zeros((len(t), 6, 5))
-    full[:, :3] = J
-    full[:, 3:, V] = J[:, :, S]
-    place = middle(target.way, states)
-    velocity = J[:, :, S] * states[:, V, None]
-    stretch = np.linalg.norm(J[:, :, S], axis=1)
+    mean = np.stack([belief.mean for _, _, belief, _ in kept])
+    order = [S, V, LATERAL, VERTICAL]
+    cov = np.stack([belief.cov for _, _, belief, _ in kept])[:, order][:, :, order]
+    place = mean[:, [S, LATERAL, VERTICAL]]
+    belief, stretch = _belief(target.way, place, mean[:, V], np.zeros((len(mean), 2)), cov)
     quads = {look.frame: look.quads for look in target.looks}
     return replace(
         settled,
         frame=[entry[0] for entry in kept],
-        t=t,
-        belief=Gaussian(
-            np.concatenate([place, velocity], axis=1), _with_drift(full @ cov @ np.swapaxes(full, 1, 2), J)
-        ),
-        speed=np.abs(states[:, V]) * stretch,
-        speed_sigma=np.sqrt(cov[:, V, V]) * stretch,
+        t=np.array([entry[1] for entry in kept]),
+        belief=belief,
+        speed=np.abs(mean[:, V]) * stretch,
+        speed_sigma=np.sqrt(cov[:, 1, 1]) * stretch,
         measured=np.array([entry[3] for entry in kept]),
         quads=[quads.get(entry[0], {}) for entry in kept],
-        corners=target.shape.points(target.way, states),
     )

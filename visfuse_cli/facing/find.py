@@ -48,10 +48,17 @@ class Finder:
         self._background = Background("mog2", config.detection.threshold, SHADOW, MEMORY_S)
         self._background.start(empty)
         self._candidates: list[_Candidate] = []
+        self.regions: list[Array] = []  # boxes [u0, v0, u1, v1] px of what moves in the latest picture
+
+    def around(self, quad: Array) -> Array | None:
+        """The quad (4, 2) of the one region of the latest picture that holds a quad (4, 2), or None."""
+        own = np.concatenate([quad.min(axis=0), quad.max(axis=0)])
+        near = [box for box in self.regions if _shared(box, own) > OVERLAP]
+        return self._quad(near[0]) if len(near) == 1 else None
 
     def look(self, picture: Image, t: float, known: list[Array]) -> list[Found]:
         """Regions that have moved for some frames, away from quads that are `known`."""
-        boxes = self._regions(picture)
+        self.regions = boxes = self._regions(picture)
         held = [np.concatenate([quad.min(axis=0), quad.max(axis=0)]) for quad in known]
         boxes = [box for box in boxes if not any(_shared(box, other) > OVERLAP for other in held)]
         self._background.learn(picture, t, [_corners(box) for box in [*boxes, *held]])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -13,15 +13,17 @@ from visfuse_cli.maths.planes import in_right, on_plane, projected, triangulated
 from visfuse_cli.records import Array, Gaussian, StereoRig
 from visfuse_cli.vision import patches
 from visfuse_cli.vision.patches import Alignment, Grey, Template
+from visfuse_cli.vision.pieces import Pieces, Seen
 
 S, V, LATERAL, VERTICAL, SIZE = range(5)  # of a state: arc length m, speed m/s, drift m, log size
 AGAIN = 0.55  # of the effective number: below, the particles are drawn anew
 SIGN_FRAMES = 2  # frames after which the direction of travel is decided
 FOUND_SHARE = 0.4  # how far the speed of what was found unaided may be off
-FACING = 0.4  # cosine of the way to the line of sight from which on its front is seen
+FACING, FACING_FOUND = 0.4, 0.97  # cosines of the way to the line of sight from which on its front is seen
 TRUST = 8.0  # times an alignment's own covariance: neighbouring samples share their errors
 STRAYED = 60.0  # squared deviations of the best particle from the patch that was found
 ACROSS_STRETCH = 0.03  # what a front that is not quite flat, or not quite so turned, differs by across the views
+SETTLE_S, ALIKE_SIZE = 1.0, 0.7  # of a patch found unaided on the region that moves; largest log of their sizes' ratio
 TEMPER = 4.0
 BLUR_PX, BLUR_STRETCH = 0.3, 0.01
 FLOOR_PX, FLOOR_STRETCH = 0.02, 0.0015
@@ -53,24 +55,24 @@ def expected(rig: StereoRig, way: Way, shape: Shape, states: Array) -> Array:
     return np.concatenate(
         [
             projected(rig.left.K, centre),
-            log_height(projected(rig.left.K, shape.points(way, states)))[..., None],
+            patches.log_height(projected(rig.left.K, shape.points(way, states)))[..., None],
             projected(rig.right.K, in_right(rig, centre)),
         ],
         axis=-1,
     )
 
 
-def shape_of(rig: StereoRig, way: Way, quad: Array, depth: float) -> tuple[Shape, Array]:
+def shape_of(rig: StereoRig, way: Way, quad: Array, depth: float, facing: float) -> tuple[Shape, Array]:
     """The front in a left quad (4, 2) px whose middle is `depth` (m) away, and its state (5,).
 
-    It faces along the way; where that is seen from the side, it faces the camera.
+    It faces along the way; where the way's cosine to the line of sight is below `facing`, it faces the camera.
     """
     ray = np.append(quad.mean(axis=0), 1.0) @ np.linalg.inv(rig.left.K).T
     place = ray * depth
     s = way.nearest(place)
     point, axes = way.frame(np.array(s))
     along = axes[:, 0] @ ray / np.linalg.norm(ray)
-    normal = axes[:, 0] if abs(along) > FACING else np.array([0.0, 0.0, 1.0])
+    normal = axes[:, 0] if abs(along) > facing else np.array([0.0, 0.0, 1.0])
     corners = on_plane(rig.left.K, quad, normal, np.asarray(normal @ place))
     # The middle of the corners in space is what is tracked.
     place = corners.mean(axis=0)
@@ -89,6 +91,7 @@ class Looked:
     R: Array
     quads: dict[str, Array]
     correlation: float
+    seen: Seen
 
 
 @dataclass(slots=True)
@@ -112,6 +115,7 @@ class Target:
     free_drift: float  # m a frame at 5 frames/s: drift where there is no path
     oriented: bool = False
     last_seen: float = 0.0
+    pieces: Pieces = field(default_factory=Pieces)
     looks: list[Looked] = field(default_factory=list)
     causal: list[tuple[int, float, Gaussian, bool]] = field(default_factory=list)
     ended_by: str = ""
@@ -140,7 +144,7 @@ def start(
     place = triangulated(rig, left.mean(axis=0), right.mean(axis=0))
     if not np.isfinite(place).all() or place[2] <= 0.1:
         return None
-    shape, state = shape_of(rig, way, left, float(place[2]))
+    shape, state = shape_of(rig, way, left, float(place[2]), FACING if given else FACING_FOUND)
     rng = np.random.default_rng((seed, identity))
     count = config.filter.particles
     states = np.tile(state, (count, 1))
@@ -263,7 +267,7 @@ def _look(target: Target, views: dict[str, list[Grey]], at: tuple[int, float]) -
     for quad in (left_quad(target), _continued(target, at[1])):
         if quad is None or not patches.inside(quad, size):
             continue
-        found = patches.align(views["left"], quad, target.sought)
+        found = patches.align(views["left"], quad, target.sought, shape=patches.KEPT)
         if found is not None and (best is None or found.correlation > best[0].correlation):
             best = (found, found.quad(quad))
     if best is None or best[0].correlation < target.config.observation.good:
@@ -279,8 +283,8 @@ def _continued(target: Target, t: float) -> Array | None:
     share = (t - last.t) / (last.t - before.t)
     tall = np.exp(last.z[2] + np.clip(share * (last.z[2] - before.z[2]), -0.5, 0.5))
     moved = last.z[:2] + share * (last.z[:2] - before.z[:2])
-    usual = left_quad(target)
-    return np.asarray(moved + tall / np.exp(log_height(usual)) * (usual - usual.mean(axis=0)))
+    usual = left_quad(target) if target.on_path else last.quads["left"]
+    return np.asarray(moved + tall / np.exp(patches.log_height(usual)) * (usual - usual.mean(axis=0)))
 
 
 def _gather(target: Target) -> None:
@@ -305,7 +309,7 @@ def _right_of(target: Target, left: Array) -> Array:
     depth = target.shape.points(target.way, target.mean)[:, 2]
     if last is not None:
         before = triangulated(rig, last.z[:2], last.z[3:])[2]
-        depth = depth / depth.mean() * before * np.exp(last.z[2] - log_height(left))
+        depth = depth / depth.mean() * before * np.exp(last.z[2] - patches.log_height(left))
     rays = np.column_stack([left, np.ones(4)]) @ np.linalg.inv(rig.left.K).T
     return projected(rig.right.K, in_right(rig, rays * depth[:, None]))
 
@@ -336,26 +340,20 @@ def _measure(
     size = views["left"][0].shape[1], views["left"][0].shape[0]
     if not patches.inside(right, size):
         return False
-    across = patches.align(views["right"], right, present, ACROSS_STRETCH)
+    across = patches.align(views["right"], right, present, ACROSS_STRETCH, patches.KEPT)
     if across is None or across.correlation < target.config.observation.good:
         return False
     right = across.quad(right)
     R = np.zeros((5, 5))
-    order = [0, 1, 3]
-    R[:3, :3] = TRUST * found.cov[np.ix_(order, order)] + np.diag([FLOOR_PX**2, FLOOR_PX**2, FLOOR_STRETCH**2])
+    R[:3, :3] = TRUST * found.cov[:3, :3] + np.diag([FLOOR_PX**2, FLOOR_PX**2, FLOOR_STRETCH**2])
     # The right middle was found from the left one: an error of the left is shared, and the search adds its own.
     R[3:, 3:] = R[:2, :2] + TRUST * across.cov[:2, :2] + FLOOR_PX**2 * np.eye(2)
     R[3:, :3], R[:3, 3:] = R[:2, :3], R[:3, :2]
-    z = np.concatenate([left.mean(axis=0), [log_height(left)], right.mean(axis=0)])
-    target.looks.append(Looked(*at, z, R, {"left": left, "right": right}, found.correlation))
+    seen, quads = target.pieces.look(views, {"left": left, "right": right})
+    left, right = quads["left"], quads["right"]
+    z = np.concatenate([left.mean(axis=0), [patches.log_height(left)], right.mean(axis=0)])
+    target.looks.append(Looked(*at, z, R, quads, found.correlation, seen))
     return True
-
-
-def log_height(quad: Array) -> Array:
-    """Log of the height (...) px of quads (..., 4, 2), which turning about the vertical does not change."""
-    return np.asarray(
-        np.log(np.linalg.norm((quad[..., 2:, :] - quad[..., :2, :][..., ::-1, :]).mean(axis=-2), axis=-1))
-    )
 
 
 def _take_over(target: Target, views: dict[str, list[Grey]]) -> None:
@@ -371,6 +369,29 @@ def _take_over(target: Target, views: dict[str, list[Grey]]) -> None:
 def left_quad(target: Target) -> Array:
     """Where the front is expected in the left view (4, 2) px."""
     return _quads(target, target.mean)["left"]
+
+
+def settle_on(target: Target, views: dict[str, list[Grey]], region: Array, dt: float) -> None:
+    """Let the patch drift to the middle of the region (4, 2) px that moves, dt (s) after the last time.
+
+    What turns shows new sides: a patch that kept to the old ones would leave the vehicle with them.
+    """
+    look = target.looks[-1]
+    left = look.quads["left"]
+    size, asked = np.array(patches.side(left)), np.array(patches.side(region))
+    shift = region.mean(axis=0) - left.mean(axis=0)
+    if np.any(np.abs(shift) > 0.5 * asked) or np.any(np.abs(np.log(asked / size)) > ALIKE_SIZE):
+        return
+    share = 1 - np.exp(-dt / SETTLE_S)
+    stretch = np.exp(share * float(np.log(asked / size).mean()))
+    quads = {}
+    for view, quad in look.quads.items():
+        middle = quad.mean(axis=0)
+        quads[view] = middle + share * shift + stretch * (quad - middle)
+    if all(patches.inside(quads[view], (views[view][0].shape[1], views[view][0].shape[0])) for view in quads):
+        target.looks[-1] = replace(look, quads=quads)
+        target.sought = patches.template(views["left"], quads["left"])
+        target.pieces.moved(look.quads, quads)
 
 
 def leaving(target: Target, size: tuple[int, int]) -> bool:

@@ -14,8 +14,10 @@ from visfuse_cli.maths.planes import in_right, projected
 from visfuse_cli.records import Array, StereoRig
 
 UP = np.array([0.0, -1.0, 0.0])  # image axes: v runs down
-KNOTS = 5  # of a curved way's inverse depth along its image
-SAMPLES = 60
+DRAWN_PX = 0.1  # how well the lines of a path are drawn
+SLOPE = 0.3  # of a road, in the left camera's axes
+FINE = 400
+FARTHEST = 1e4  # m
 
 
 class Way:
@@ -26,13 +28,13 @@ class Way:
         if len(points) < 2 or not np.isfinite(points).all() or np.any(step < 1e-6):
             raise ValueError("a path needs two different points or more")
         self.s = np.concatenate([[0.0], np.cumsum(step)])
-        self._curve = CubicSpline(self.s, points, bc_type="natural") if len(points) > 2 else None
+        self._curve = _spline(self.s, points) if len(points) > 2 else None
         self._points = points
         if self._curve is not None:  # chords are shorter than the arc: measure the spline, and lay knots evenly on it
             fine = np.linspace(0, self.s[-1], 100 * len(points))
             length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(self._curve(fine), axis=0), axis=1))])
             self.s = np.linspace(0, length[-1], 6 * len(points))
-            self._curve = CubicSpline(self.s, self._curve(np.interp(self.s, length, fine)), bc_type="natural")
+            self._curve = _spline(self.s, self._curve(np.interp(self.s, length, fine)))
 
     @property
     def length(self) -> float:
@@ -68,6 +70,11 @@ class Way:
     def reversed(self) -> Way:
         """The same way taken from its end."""
         return Way(self._points[::-1].copy())
+
+
+def _spline(s: Array, points: Array) -> CubicSpline:
+    """A cubic spline; its ends are as bent as what lies beside them, where that can be told."""
+    return CubicSpline(s, points, bc_type="not-a-knot" if len(points) > 3 else "natural")
 
 
 def straight(rig: StereoRig, left: Array, right: Array) -> Way:
@@ -106,48 +113,51 @@ def _plane_of(K: Array, line: Array) -> Array:
 def curved(rig: StereoRig, left: Array, right: Array) -> Way:
     """The way whose images are polylines left (n, 2) and right (m, 2) px, which need not correspond.
 
-    Along the left image the inverse depth is a low polynomial, so chosen that the way's right image lies on the other
-    polyline. Raises ValueError where no such way lies before the cameras.
+    It lies on a road that is flat: the road is sought on which both polylines are one curve, which is smoother there
+    than in the pictures. Raises ValueError where no such road lies before the cameras.
     """
-    step = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(left, axis=0), axis=1))])
-    along = np.linspace(0, step[-1], SAMPLES)
-    curve = CubicSpline(step, left, bc_type="natural") if len(left) > 2 else None
-    pixels = curve(along) if curve is not None else np.stack([np.interp(along, step, left[:, c]) for c in (0, 1)], 1)
-    rays = np.column_stack([pixels, np.ones(SAMPLES)]) @ np.linalg.inv(rig.left.K).T
-    x = np.linspace(-1, 1, SAMPLES)
-    basis = np.polynomial.legendre.legvander(x, min(KNOTS, len(left)) - 1)
-    goal = _resampled(right)
+    away = np.column_stack([left, np.ones(len(left))]) @ np.linalg.inv(rig.left.K).T
+    rays = {"left": away, "right": np.column_stack([right, np.ones(len(right))]) @ np.linalg.inv(rig.right.K).T @ rig.R}
+    centres = {"left": np.zeros(3), "right": -rig.R.T @ rig.T}
 
-    def points(c: Array) -> Array:
-        return np.asarray(rays / np.maximum(basis @ c, 1e-5)[:, None])
+    def on_road(view: str, road: Array) -> Array:
+        # height below the camera, slope to the right and ahead: Y = h + a X + b Z
+        normal = np.array([-road[1], 1.0, -road[2]])
+        facing = rays[view] @ normal
+        depth = (road[0] - centres[view] @ normal) / np.where(np.abs(facing) > 1e-6, facing, 1e-6)
+        return np.asarray(centres[view] + depth[:, None] * rays[view])
 
-    def off(c: Array) -> Array:
-        seen = projected(rig.right.K, in_right(rig, points(c)))
-        distance = _to_polyline(np.nan_to_num(seen, nan=1e4), goal)
-        return np.concatenate([distance, c[2:]])  # a weak pull towards a straight way
+    def off(road: Array) -> Array:
+        here, there = on_road("left", road), on_road("right", road)
+        seen = projected(rig.right.K, in_right(rig, _resampled(here)))
+        seen_back = projected(rig.left.K, _resampled(there))
+        distance = [
+            _to_polyline(right, np.nan_to_num(seen, nan=1e4)),
+            _to_polyline(left, np.nan_to_num(seen_back, nan=1e4)),
+        ]
+        return np.concatenate([np.clip(each, -1e3, 1e3) / DRAWN_PX for each in distance] + [road[1:] / SLOPE])
 
     best = None
-    for depth in (10.0, 25.0, 60.0):
-        start = np.zeros(basis.shape[1])
-        start[0] = 1 / depth
-        found = least_squares(off, start, x_scale=np.full(len(start), 0.01), max_nfev=200)
+    for depth in (8.0, 15.0, 30.0, 60.0, 120.0):
+        found = least_squares(off, np.array([float(np.mean(away[:, 1])) * depth, 0.0, 0.0]), max_nfev=100)
         if best is None or found.cost < best.cost:
             best = found
     assert best is not None
-    if np.sqrt(np.mean(off(best.x)[:SAMPLES] ** 2)) > 3.0 or np.any(basis @ best.x < 1e-4):
-        raise ValueError("the two images of the path do not fit one curve before both cameras")
-    curve_points = points(np.asarray(best.x))
-    way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(curve_points, axis=0), axis=1))])
-    picked = np.unique(np.searchsorted(way, np.linspace(0, way[-1], 13)).clip(0, SAMPLES - 1))
-    return Way(curve_points[picked])
+    points = on_road("left", best.x)
+    if np.sqrt(np.mean(off(best.x)[:-2] ** 2)) * DRAWN_PX > 3.0 or np.any(
+        (points[:, 2] < 0.1) | (points[:, 2] > FARTHEST)
+    ):
+        raise ValueError("the two images of the path do not fit one curve on a road before both cameras")
+    return Way(points)
 
 
 def _resampled(line: Array) -> Array:
-    step = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
-    fine = np.linspace(0, step[-1], 400)
+    """Many points (FINE, c) evenly along a smooth curve through points (n, c)."""
+    step = np.concatenate([[0.0], np.cumsum(np.maximum(np.linalg.norm(np.diff(line, axis=0), axis=1), 1e-9))])
+    fine = np.linspace(0, step[-1], FINE)
     if len(line) > 2:
-        return np.asarray(CubicSpline(step, line, bc_type="natural")(fine))
-    return np.stack([np.interp(fine, step, line[:, c]) for c in (0, 1)], axis=1)
+        return np.asarray(_spline(step, line)(fine))
+    return np.stack([np.interp(fine, step, line[:, c]) for c in range(line.shape[1])], axis=1)
 
 
 def _to_polyline(points: Array, line: Array) -> Array:
@@ -155,7 +165,7 @@ def _to_polyline(points: Array, line: Array) -> Array:
     k = np.argmin(np.sum((points[:, None] - line[None]) ** 2, axis=-1), axis=1)
     k = np.clip(k, 1, len(line) - 2)
     tangent = line[k + 1] - line[k - 1]
-    tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
+    tangent /= np.maximum(np.linalg.norm(tangent, axis=1, keepdims=True), 1e-9)
     away = points - line[k]
     return np.asarray(tangent[:, 0] * away[:, 1] - tangent[:, 1] * away[:, 0])
 

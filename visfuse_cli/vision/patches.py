@@ -22,6 +22,7 @@ VISIBLE = 0.6  # share of a patch that must be in the picture
 SEARCH = 0.8  # of its size: how far around the prediction a lost target is looked for
 PLAIN = 4.0  # grey levels: differences of neighbouring samples of a patch without edges are smaller
 AROUND, AROUND_PX = 0.12, 3.0  # of its side, and px: how far its template then reaches beyond it
+FREE, KEPT = np.eye(4), np.array([[1.0, 0, 0], [0, 1, 0], [0, 0, 1], [0, 0, 1]])  # of a patch's stretch, by its freedom
 RIM_PX = 0.5  # px inside of a quad at which its patch begins: beyond its edge lies something else
 
 
@@ -37,7 +38,7 @@ def pyramid(image: Image) -> list[Grey]:
 
 def sampled(levels: list[Grey], points: Array, spacing: float) -> Grey:
     """Grey values (...) at pixels (..., 2), from the level whose pixels are as wide as `spacing` (px); 0 outside."""
-    level = int(np.clip(np.floor(np.log2(max(spacing, 1.0)) + 0.3), 0, len(levels) - 1))
+    level = int(np.clip(np.floor(np.log2(np.nan_to_num(max(spacing, 1.0), nan=1.0)) + 0.3), 0, len(levels) - 1))
     at = (points / 2**level).astype(np.float32)
     flat = np.ascontiguousarray(at.reshape(-1, 2))
     # One row of the picture that is made for each pose.
@@ -71,6 +72,13 @@ def side(quad: Array) -> tuple[float, float]:
     """Mean width and height (px) of a quad (4, 2)."""
     edge = np.linalg.norm(np.roll(quad, -1, axis=0) - quad, axis=1)
     return float(edge[0] + edge[2]) / 2, float(edge[1] + edge[3]) / 2
+
+
+def log_height(quad: Array) -> Array:
+    """Log of the height (...) px of quads (..., 4, 2), which turning about the vertical does not change."""
+    return np.asarray(
+        np.log(np.linalg.norm((quad[..., 2:, :] - quad[..., :2, :][..., ::-1, :]).mean(axis=-2), axis=-1))
+    )
 
 
 def inside(quad: Array, size: tuple[int, int], margin: float = 1.0) -> bool:
@@ -167,17 +175,19 @@ class Alignment:
         return np.asarray(middle + self.shift + np.exp(self.stretch) * (quad - middle))
 
 
-def align(levels: list[Grey], quad: Array, sought: Template, stretch_sigma: float = np.inf) -> Alignment | None:
+def align(
+    levels: list[Grey], quad: Array, sought: Template, stretch_sigma: float = np.inf, shape: Array = FREE
+) -> Alignment | None:
     """Find a template near a quad (4, 2) by Gauss-Newton on grey values, gain and offset free; None where it is lost.
 
-    The log stretch is believed to be zero but for `stretch_sigma`.
+    The log stretch is believed to be zero but for `stretch_sigma`; with `shape` KEPT it is the same across and down.
     """
     points = warped(quad, sought.unit)
     middle = quad.mean(axis=0)
     spacing = _spacing(quad, _count(sought.unit))
-    p = np.zeros(4)
+    p, free = np.zeros(4), shape.shape[1]
     reach = max(3.0, 0.25 * min(side(quad)))
-    A, weight, left = np.zeros((4, 4)), np.ones(len(points)), np.zeros(len(points))
+    A, weight, left = np.zeros((free, free)), np.ones(len(points)), np.zeros(len(points))
     now, h = sought.values, max(0.5, spacing / 2)
     gain, noise2 = 1.0, 1.0
     for _ in range(ROUNDS):
@@ -192,13 +202,13 @@ def align(levels: list[Grey], quad: Array, sought: Template, stretch_sigma: floa
         gx, gy = (values[1] - values[2]) / (2 * h), (values[3] - values[4]) / (2 * h)
         scaled = np.exp(p[2:]) * away
         J = np.column_stack([gx, gy, gx * scaled[:, 0], gy * scaled[:, 1]])
-        X = np.column_stack([J, now, np.ones(len(now))])
+        X = np.column_stack([J @ shape, now, np.ones(len(now))])
         # template = a I(x(p)) + b: linear in gain and offset, so they are solved with the step
         W = weight[:, None] * X
-        normal, known = W.T @ X + 1e-9 * np.eye(6), W.T @ sought.values
+        normal, known = W.T @ X + 1e-9 * np.eye(free + 2), W.T @ sought.values
         pull = noise2 / (gain**2 * stretch_sigma**2)  # of the prior, on gain times stretch
-        normal[[2, 3], [2, 3]] += pull
-        known[2:4] -= pull * gain * p[2:]
+        normal[:free, :free] += pull * shape[2:].T @ shape[2:]
+        known[:free] -= pull * gain * shape[2:].T @ p[2:]
         solution = np.linalg.lstsq(normal, known, rcond=None)[0]
         gain = float(solution[-2])
         if gain <= 0.05:
@@ -207,16 +217,17 @@ def align(levels: list[Grey], quad: Array, sought: Template, stretch_sigma: floa
         scale = 1.4826 * float(np.median(np.abs(left))) + 1e-6
         noise2 = scale**2
         weight = np.minimum(1.0, HUBER * scale / np.maximum(np.abs(left), 1e-9))
-        step = solution[:4] / gain
+        step = shape @ solution[:free] / gain
         p = p + np.clip(step, -2 * spacing, 2 * spacing) * [1, 1, 0.5, 0.5]
         if np.linalg.norm(p[:2]) > reach or np.any(np.abs(p[2:]) > 0.5):
             return None
-        A = gain**2 * (W[:, :4].T @ X[:, :4])
+        A = gain**2 * (W[:, :free].T @ X[:, :free])
         if np.linalg.norm(step[:2]) < 0.002 and np.abs(step[2:]).max() < 2e-5:
             break
-    sigma2 = float(np.sum(weight * left**2) / max(np.sum(weight) - 6, 1))
+    sigma2 = float(np.sum(weight * left**2) / max(np.sum(weight) - free - 2, 1))
     correlation = float(np.corrcoef(now, sought.values)[0, 1])
-    return Alignment(p[:2], p[2:], np.asarray(np.linalg.pinv(A), dtype=float) * sigma2, correlation)
+    cov = np.asarray(shape @ np.linalg.pinv(A) @ shape.T, dtype=float) * sigma2
+    return Alignment(p[:2], p[2:], cov, correlation)
 
 
 def searched(level: Grey, quad: Array, sought: Template, reach: float, good: float) -> Array | None:
@@ -248,9 +259,8 @@ def part_values(levels: list[Grey], quads: Array) -> Array:
     In orthonormal form the distance of a part's 16 Haar-like values is that of its 16 cells. Zhu 2012, eq. 13.
     """
     unit = grid((PARTS[0] * CELLS, PARTS[1] * CELLS))
-    values = sampled(levels, warped(quads, unit), _spacing(quads[0], (PARTS[0] * CELLS, PARTS[1] * CELLS))).astype(
-        float
-    )
+    some = [_spacing(quad, (PARTS[0] * CELLS, PARTS[1] * CELLS)) for quad in quads[:: len(quads) // 9 + 1]]
+    values = sampled(levels, warped(quads, unit), float(np.median(some))).astype(float)
     values -= values.mean(axis=-1, keepdims=True)
     return np.asarray(values / np.maximum(values.std(axis=-1, keepdims=True), 1e-3))
 
