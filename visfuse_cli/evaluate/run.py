@@ -107,7 +107,8 @@ def _compared(run: Estimates, truth: Table, path: Path, plane: bool, warnings: l
         return run.axes
     if needs_z and not known.all():
         line = truth.line[np.flatnonzero(~known)[0]]
-        raise InputError(f"{path}, line {line}, column z: is empty; the run is in 3D (--plane compares on the ground)")
+        why = "on the ground too the run is compared along z" if plane else "the run is in 3D; --plane: on the ground"
+        raise InputError(f"{path}, line {line}, column z: is empty; {why}")
     return axes
 
 

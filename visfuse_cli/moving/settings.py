@@ -50,7 +50,7 @@ class FilterSettings(Section):
     kind: Literal["imm", "drifting", "cv", "ca", "periodic", "csd", "cs", "cd"] = Field(
         "imm", description="all of them, or one alone; csd, cs and cd are those of a pan-tilt head"
     )
-    stay: float = Field(0.97, gt=0.5, lt=1, description="probability that a model goes on over one frame")
+    stay: float = Field(0.985, gt=0.5, lt=1, description="probability that a model goes on over one frame")
     q_drifting: float = Field(0.2, gt=0, description="m^2/s of a drifting point's walk")
     q_cv: float = Field(0.01, gt=0, description="m^2 s^-3 of constant velocity: tight, for straight ways")
     q_ca: float = Field(4.0, gt=0, description="m^2 s^-5 of constant acceleration")

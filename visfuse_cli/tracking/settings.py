@@ -73,7 +73,8 @@ class FilterSettings(Section):
     kind: Literal["fading", "ekf", "cuf", "fading-cuf", "imm"] = Field(
         "fading",
         description="ekf: extended Kalman filter; fading: the same with a fading factor, prompt in manoeuvres; "
-        "cuf: with the acceleration in the state; fading-cuf: both; imm: three motions by speed and course",
+        "cuf: with the acceleration in the state; fading-cuf: both; imm: three motions by speed and course, which "
+        "sees furthest ahead",
     )
     sigma_a: float = Field(0.8, gt=0, le=50, description="m/s^2 per root Hz: how hard the target accelerates")
     sigma_steer: float = Field(0.1, gt=0, le=5, description="rad/s per root Hz: how fast the steering angle changes")
