@@ -64,7 +64,7 @@ def test_how_steep_a_border_is():
 
 @pytest.mark.parametrize("seed", [4])
 def test_nothing_is_measured_in_the_dark(seed, tmp_path):
-    write_night(free_flow(seed, 4, (640, 360)), tmp_path, ambient=0.02)
+    write_night(free_flow(seed, 3, (480, 270)), tmp_path, ambient=0.02)
 
     def visfuse(*args):
         done = subprocess.run([sys.executable, "-m", "visfuse_cli", *map(str, args)], capture_output=True, text=True)

@@ -119,6 +119,6 @@ def test_lanes_are_found_once_and_used_again(tmp_path):
     first = rows(tmp_path / "first" / "speeds.csv")
     assert {row["lane"] for row in first} - {""}
     assert site.read_bytes() == (tmp_path / "first" / "lanes.yaml").read_bytes()
-    visfuse(*options, f"lanes_file={site}", "--out", tmp_path / "second")
-    assert rows(tmp_path / "second" / "speeds.csv") == first
+    visfuse(*options, f"lanes_file={site}", "--end", "1", "--out", tmp_path / "second")
+    assert site.read_bytes() == (tmp_path / "second" / "lanes.yaml").read_bytes()
     assert load(SpeedConfig, str(site)).lanes == read_lanes(site)

@@ -73,7 +73,7 @@ def test_strangers_are_remembered_by_frame():
 
 
 def test_the_annotated_video_shows_no_plate(tmp_path):
-    write_scene(free_flow(4, 3, size=(480, 270)), tmp_path)
+    write_scene(free_flow(4, 2, size=(480, 270)), tmp_path)
 
     def visfuse(*args):
         done = subprocess.run([sys.executable, "-m", "visfuse_cli", *map(str, args)], capture_output=True, text=True)
