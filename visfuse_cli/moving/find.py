@@ -17,6 +17,7 @@ from visfuse_cli.vision.flow import own_motion
 SAMPLES = 3000  # pixels that are clustered, at most
 FILLED = 0.3  # share of a region's box that moves by itself
 AROUND = np.array([0.2, 0.3])  # of its sides: around what is followed already nothing is looked for
+THIN, FEWEST = 3, 50  # of the pixels, each way, that tell what is usual, and the fewest of these
 FARTHEST_M = 40.0
 WIDER, KEPT = 0.15, 0.6  # how far around a box its outline is looked for, and the least share of a side then left
 RIM = 3.0  # px from the edge of the picture
@@ -110,16 +111,19 @@ class Finder:
     def _moving(self, depth: Array, flow: Array, before: Head, now: Head) -> tuple[Image, Array]:
         """Where (H, W) the flow is not what the camera's own motion gives at that depth, and what it leaves over."""
         R, t = now.R.T @ before.R, now.R.T @ (before.T - now.T)
-        rest = flow - own_motion(depth, self._rig.left.K, R, t)
-        usable = np.isfinite(depth) & (depth < FARTHEST_M) & np.isfinite(rest).all(axis=-1)
-        if np.count_nonzero(usable) < 200:
+        explained = own_motion(depth, self._rig.left.K, R, t)
+        rest = flow - explained
+        usable = (depth < FARTHEST_M) & np.isfinite(rest[..., 0])
+        sample = rest[::THIN, ::THIN][usable[::THIN, ::THIN]]
+        if len(sample) < FEWEST:
             return np.zeros(depth.shape, np.uint8), rest
-        middle = np.median(rest[usable], axis=0)
-        spread = 1.4826 * np.median(np.abs(rest[usable] - middle))
+        middle = np.median(sample, axis=0)
+        spread = 1.4826 * np.median(np.abs(sample - middle))
         # Near things have more flow, and so more of its error.
-        explained = np.linalg.norm(flow - rest, axis=-1)
-        least = self._config.segmentation.residual_px + 3 * spread + 0.12 * np.nan_to_num(explained)
-        mask = (usable & (np.linalg.norm(rest - middle, axis=-1) > least)).astype(np.uint8)
+        flowing = np.hypot(explained[..., 0], explained[..., 1])
+        least = self._config.segmentation.residual_px + 3 * spread + 0.12 * flowing
+        off = np.hypot(rest[..., 0] - middle[0], rest[..., 1] - middle[1])
+        mask = (usable & (off > least)).astype(np.uint8)
         mask = cv2.morphologyEx(mask, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
         return np.asarray(cv2.morphologyEx(mask, cv2.MORPH_CLOSE, np.ones((7, 7), np.uint8)), np.uint8), rest
 

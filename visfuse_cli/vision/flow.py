@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import cv2
 import numpy as np
 
@@ -31,20 +33,32 @@ def horn_schunck(before: Image, after: Image, smoothness: float, iterations: int
             flow = 2 * cv2.resize(flow, size, interpolation=cv2.INTER_LINEAR)
         u, v = np.meshgrid(np.arange(size[0], dtype=np.float32), np.arange(size[1], dtype=np.float32))
         for _ in range(WARPS):
-            base = flow
             moved = cv2.remap(
-                second, u + base[..., 0], v + base[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+                second, u + flow[..., 0], v + flow[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
             )
             middle = (first + moved) / 2
             gx, gy = (cv2.Sobel(middle, cv2.CV_32F, *axis, ksize=3, scale=1 / 8) for axis in ((1, 0), (0, 1)))
             gt = moved - first
-            below = smoothness**2 + gx**2 + gy**2
-            for _ in range(max(iterations // WARPS, 1)):
-                mean = cv2.filter2D(flow, -1, MEAN, borderType=cv2.BORDER_REPLICATE)
-                off = mean - base
-                share = (gx * off[..., 0] + gy * off[..., 1] + gt) / below
-                flow = mean - share[..., None] * np.stack([gx, gy], axis=-1)
+            flow = _smoothed(flow, gx, gy, gt, smoothness, max(iterations // WARPS, 1))
     return np.asarray(flow, dtype=float)
+
+
+def _smoothed(flow: Array, gx: Array, gy: Array, gt: Array, smoothness: float, rounds: int) -> Array:
+    """Flow (H, W, 2) after some rounds of the scheme of Horn and Schunck, from one linearisation."""
+    below = 1 / (smoothness**2 + gx**2 + gy**2)
+    ax, ay = gx * below, gy * below
+    u, v = (np.ascontiguousarray(flow[..., k]) for k in (0, 1))
+    rest = gt - gx * u - gy * v
+    mu, mv, share, part = (np.empty_like(u) for _ in range(4))
+    for _ in range(rounds):
+        cv2.filter2D(u, -1, MEAN, mu, borderType=cv2.BORDER_REPLICATE)
+        cv2.filter2D(v, -1, MEAN, mv, borderType=cv2.BORDER_REPLICATE)
+        np.multiply(gx, mu, out=share)
+        share += np.multiply(gy, mv, out=part)
+        share += rest
+        np.subtract(mu, np.multiply(ax, share, out=part), out=u)
+        np.subtract(mv, np.multiply(ay, share, out=part), out=v)
+    return np.stack([u, v], axis=-1)
 
 
 def dis(before: Image, after: Image) -> Array:
@@ -60,9 +74,18 @@ def own_motion(depth: Array, K: Array, R: Array, t: Array) -> Array:
     the turning counts.
     """
     high, wide = depth.shape
-    u, v = np.meshgrid(np.arange(wide, dtype=float), np.arange(high, dtype=float))
-    rays = np.stack([(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], np.ones_like(u)], axis=-1)
-    moved = rays @ R.T + t / depth[..., None]
-    with np.errstate(invalid="ignore", divide="ignore"):
-        seen = moved[..., :2] / np.where(moved[..., 2:] > 1e-6, moved[..., 2:], np.nan)
-    return np.stack([seen[..., 0] * K[0, 0] + K[0, 2] - u, seen[..., 1] * K[1, 1] + K[1, 2] - v], axis=-1)
+    rays = _rays(high, wide, K[0, 0], K[1, 1], K[0, 2], K[1, 2])
+    nearness = (1 / depth).astype(np.float32)
+    x, y, z = (
+        rays[0] * row[0] + rays[1] * row[1] + (nearness * shift + row[2])
+        for row, shift in zip(R.astype(np.float32), t.astype(np.float32), strict=True)
+    )
+    z = np.where(z > 1e-6, z, np.nan)
+    return np.stack([(x / z - rays[0]) * np.float32(K[0, 0]), (y / z - rays[1]) * np.float32(K[1, 1])], axis=-1)
+
+
+@lru_cache(maxsize=4)
+def _rays(high: int, wide: int, fx: float, fy: float, cx: float, cy: float) -> tuple[Array, Array]:
+    """Across and down (1, W) and (H, 1) of the rays through all pixels at unit depth."""
+    across, down = (np.arange(wide) - cx) / fx, (np.arange(high) - cy) / fy
+    return across[None].astype(np.float32), down[:, None].astype(np.float32)

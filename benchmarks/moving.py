@@ -1,0 +1,237 @@
+"""Moving heads: `python benchmarks/moving.py --seeds 10 [--keep DIR] [--only visits crossings still street gaze speed]`
+
+Rendered rooms (a target 3-6 m away that goes straight, turns and leaves; two people who cross; nobody at all), the
+recorded street, rendered pan-tilt heads, and the CPU time of each frame with the video written, all through the real
+command. `--keep` keeps the rendered scenes, and takes those that are there.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import json
+import resource
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+from samples.gaze import write_gaze, yard
+from samples.head import room, visit, write_head
+
+Array = NDArray[np.float64]
+STREET = Path(__file__).parents[2] / "shared" / "data" / "imm-street"
+MODELS = ("imm", "drifting", "cv", "ca", "periodic")
+TURNING = 0.25  # rad/s of the true course, from which on a target turns
+PARTS = ("visits", "crossings", "still", "street", "gaze", "speed")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seeds", type=int, default=10)
+    parser.add_argument("--keep", type=Path)
+    parser.add_argument("--only", nargs="*", choices=PARTS, default=PARTS)
+    args = parser.parse_args()
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = args.keep or Path(temporary)
+        for part in args.only:
+            globals()[part](folder, args.seeds)
+
+
+def rendered(folder: Path, write: Callable[[Path], None]) -> Path:
+    """The scene in a folder, written where it is not there yet."""
+    if not (folder / "truth.csv").is_file():
+        write(folder)
+    return folder
+
+
+def run(scene: Path, *options: str, video: bool = False) -> tuple[dict[str, Any], dict[str, Any], float]:
+    """tracks.json and run.json of a run, and its CPU seconds."""
+    with tempfile.TemporaryDirectory() as out:
+        command = [
+            sys.executable,
+            "-m",
+            "visfuse_cli",
+            "-q",
+            "track-imm",
+            str(scene),
+            "--out",
+            out + "/run",
+            "--no-report",
+        ]
+        before = resource.getrusage(resource.RUSAGE_CHILDREN)
+        subprocess.run([*command, *options, *([] if video else ["--no-video"])], check=True)
+        after = resource.getrusage(resource.RUSAGE_CHILDREN)
+        documents = [json.loads((Path(out) / "run" / name).read_text()) for name in ("tracks.json", "run.json")]
+    return documents[0], documents[1], after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+
+
+def wheels(scene: Path, *options: str, **rest: Any) -> tuple[dict[str, Any], dict[str, Any], float]:
+    return run(scene, "--set", "odometry.wheel_separation=0.4", *options, **rest)
+
+
+def without_init(scene: Path, folder: Path) -> Path:
+    """The same scene without init.yaml, by links."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for entry in scene.iterdir():
+        link = folder / entry.name
+        if entry.name != "init.yaml" and not link.exists():
+            link.symlink_to(entry.resolve())
+    return folder
+
+
+def truth(scene: Path) -> dict[int, dict[int, Array]]:
+    """By target and frame: x, y, z, vx, vy, vz (6,); what is empty is NaN."""
+    found: dict[int, dict[int, Array]] = {}
+    with open(scene / "truth.csv", newline="") as file:
+        for row in csv.DictReader(file):
+            values = np.array([float(row[k] or "nan") for k in ("x", "y", "z", "vx", "vy", "vz")])
+            found.setdefault(int(row["id"]), {})[int(row["frame"])] = values
+    return found
+
+
+def errors(track: dict[str, Any], true: dict[int, Array], size: int) -> tuple[list[int], Array, Array]:
+    """Frames, errors (n, 2 size) and true states (n, 6) of one track against one target."""
+    states = [s for s in track["states"] if s["frame"] in true]
+    at = np.array([true[s["frame"]] for s in states]).reshape(-1, 6)
+    off = np.array([[*s["position"], *s["velocity"]] for s in states]).reshape(-1, 2 * size)
+    return [s["frame"] for s in states], off - at[:, [*range(size), *range(3, 3 + size)]], at
+
+
+def rms(values: Array) -> float:
+    return float(np.sqrt(np.mean(np.sum(values**2, axis=-1)))) if len(values) else float("nan")
+
+
+def turning(true: dict[int, Array], frames: list[int], fps: float = 15.0) -> NDArray[np.bool_]:
+    """Whether the target's course turns at those frames."""
+    every = sorted(true)
+    course = np.unwrap([np.arctan2(true[k][5], true[k][3]) for k in every])
+    rate = dict(zip(every, np.abs(np.gradient(course) * fps), strict=True))
+    return np.array([rate[k] > TURNING for k in frames])
+
+
+def visits(folder: Path, seeds: int) -> None:
+    print(
+        f"\n{'visit':<7} {'':<5} {'tracks':>6} {'frames':>8} {'RMSE m':>7} {'% range':>8} {'speed m/s':>9}   turn RMS m"
+    )
+    turns: dict[str, list[Array]] = {name + mode: [] for name in MODELS for mode in ("", "/causal")}
+    worst = np.zeros(2)
+    for seed in range(seeds):
+        scene = rendered(folder / f"visit{seed}", lambda out, seed=seed: write_head(visit(seed), out, init=True))
+        true = truth(scene)[1]
+        for name, where in (("init", scene), ("bare", without_init(scene, folder / f"visit{seed}-bare"))):
+            tracks = wheels(where)[0]["tracks"]
+            best = max(tracks, key=lambda t: len(t["states"]), default={"states": []})
+            frames, off, at = errors(best, true, 3)
+            share = 100 * np.sqrt(np.mean(np.sum(off[:, :3] ** 2, 1) / np.sum(at[:, :3] ** 2, 1)))
+            speed = rms(off[:, 3:])
+            worst = np.maximum(worst, [share, speed])
+            row = f"{len(tracks):6d} {len(frames):4d}/{len(true):<3d} {rms(off[:, :3]):7.3f} {share:8.2f} {speed:9.3f}"
+            print(f"{seed:<7} {name:<5} {row}")
+        for name in MODELS:
+            for mode, options in (("", []), ("/causal", ["--set", "smooth=false"])):
+                tracks = wheels(scene, "--set", f"filter.kind={name}", *options)[0]["tracks"]
+                if tracks:
+                    frames, off, _ = errors(tracks[0], true, 3)
+                    turns[name + mode].append(off[turning(true, frames), :3])
+    print(f"worst: {worst[0]:.2f} % of the range, {worst[1]:.3f} m/s")
+    for mode in ("", "/causal"):
+        values = {name: rms(np.concatenate(turns[name + mode])) for name in MODELS}
+        print(f"on the turn{mode}, RMS m: " + ", ".join(f"{name} {value:.4f}" for name, value in values.items()))
+
+
+def crossings(folder: Path, seeds: int) -> None:
+    print(f"\n{'crossing':<9} {'':<5} {'tracks':>6} {'exchanged':>9} {'RMSE m':>7} {'speed m/s':>9}")
+    for seed in range(seeds):
+        scene = rendered(folder / f"two{seed}", lambda out, seed=seed: write_head(room(seed, people=2), out, init=True))
+        true = truth(scene)
+        for name, where in (("init", scene), ("bare", without_init(scene, folder / f"two{seed}-bare"))):
+            tracks = wheels(where)[0]["tracks"]
+            exchanged, off = 0, []
+            for track in tracks:
+                nearest = [
+                    min(
+                        (rms(np.array([s["position"] - t[s["frame"]][:3]])), k)
+                        for k, t in true.items()
+                        if s["frame"] in t
+                    )
+                    for s in track["states"]
+                    if any(s["frame"] in t for t in true.values())
+                ]
+                owners = [k for _, k in nearest]
+                exchanged += int(len(owners) > 0 and owners[0] != owners[-1])
+                off.append(errors(track, true[max(set(owners), key=owners.count)], 3)[1])
+            every = np.concatenate(off) if off else np.zeros((0, 6))
+            print(
+                f"{seed:<9} {name:<5} {len(tracks):6d} {exchanged:9d} {rms(every[:, :3]):7.3f} {rms(every[:, 3:]):9.3f}"
+            )
+
+
+def still(folder: Path, seeds: int) -> None:
+    print("\nstill rooms")
+    for seed in range(min(seeds, 4)):
+        scene = rendered(
+            folder / f"still{seed}",
+            lambda out, seed=seed: write_head(room(seed + 20, still=True, seconds=5.0), out),
+        )
+        print(f"{seed}: {len(wheels(scene)[0]['tracks'])} targets")
+
+
+def street(folder: Path, seeds: int) -> None:
+    if not STREET.is_dir():
+        print("\nstreet: the recordings lie beside the project; they are not here")
+        return
+    options = ("--config", "street", "--set", "video.fps=10")
+    (track,) = run(STREET, *options)[0]["tracks"]
+    places = np.array([s["position"] for s in track["states"]])
+    speed = float(np.median([s["speed"] for s in track["states"]]))
+    spread = float(np.linalg.norm(places - np.median(places, axis=0), axis=1).max())
+    seen = sum(s["measured"] for s in track["states"])
+    print(f"\nstreet: parked car measured in {seen} frames, median {speed:.2f} m/s, within {spread:.2f} m of one place")
+    bare = run(without_init(STREET, folder / "street-bare"), *options)[0]["tracks"]
+    print(f"street without init.yaml: {len(bare)} targets")
+
+
+def gaze(folder: Path, seeds: int) -> None:
+    print(f"\n{'pan-tilt':<9} {'tracks':>6} {'frames':>8} {'RMSE m':>7} {'% range':>8} {'2D mrad':>8} {'3D mrad':>8}")
+    for seed in range(min(seeds, 5)):
+        scene = rendered(folder / f"gaze{seed}", lambda out, seed=seed: write_gaze(yard(seed), out, angle_noise=2e-4))
+        if not (scene / "homography.json").is_file():
+            survey = [
+                "calibrate-homography",
+                "--gaze",
+                str(scene / "gaze.csv"),
+                "--out",
+                str(scene / "homography.json"),
+            ]
+            subprocess.run([sys.executable, "-m", "visfuse_cli", "-q", *survey], check=True)
+        tracks, document, _ = run(scene, "--config", "pan-tilt", "--set", "target.height=0.85")
+        head, true = np.array(document["head"]["position"]), truth(scene)[1]
+        best = max(tracks["tracks"], key=lambda t: len(t["states"]))
+        frames, off, at = errors(best, true, 2)
+        far = np.hypot(*(at[:, :2] - head[:2]).T)
+        share = 100 * np.sqrt(np.mean(np.sum(off[:, :2] ** 2, 1) / far**2))
+        plane, ground = (1e3 * best["summary"][f"prediction_rms_{kind}"] for kind in ("2d", "3d"))
+        row = f"{len(tracks['tracks']):6d} {len(frames):4d}/{len(true):<3d} {rms(off[:, :2]):7.3f} {share:8.2f}"
+        print(f"{seed:<9} {row} {plane:8.2f} {ground:8.2f}")
+
+
+def speed(folder: Path, seeds: int) -> None:
+    print(f"\n{'CPU ms a pair, video written':<40} {'all':>6} {'goal on two cores':>18}")
+    for name, size, method, rate in (("256x220", (256, 220), "horn-schunck", 15), ("320x240", (320, 240), "dis", 30)):
+        scene = rendered(folder / f"speed{name}", lambda out, size=size: write_head(visit(1, size=size), out))
+        start = wheels(scene, "--end", "0.2", "--set", f"flow.method={method}")
+        whole = wheels(scene, "--set", f"flow.method={method}", video=True)
+        pairs = whole[1]["counts"]["frames"] - start[1]["counts"]["frames"]
+        print(f"{name + ' ' + method:<40} {1e3 * (whole[2] - start[2]) / pairs:6.1f} {2e3 / rate:18.1f}")
+
+
+if __name__ == "__main__":
+    main()
