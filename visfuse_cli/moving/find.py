@@ -19,7 +19,9 @@ FILLED = 0.3  # share of a region's box that moves by itself
 AROUND = np.array([0.2, 0.3])  # of its sides: around what is followed already nothing is looked for
 THIN, FEWEST = 3, 50  # of the pixels, each way, that tell what is usual, and the fewest of these
 FARTHEST_M = 40.0
+NEAR = 0.25  # of the larger side of the smaller region: a gap across which both may be one thing
 WIDER, KEPT = 0.15, 0.6  # how far around a box its outline is looked for, and the least share of a side then left
+BESIDE = 0.2  # of its width: what lies beside it and nearer may hide part of it
 RIM = 3.0  # px from the edge of the picture
 SLOWEST = 0.15  # m/s that a region must do in the world
 
@@ -54,18 +56,27 @@ class Finder:
             0, self._disparities, 5, 8 * 25, 32 * 25, 1, 31, 10, 60, 2
         )
         self._candidates: list[_Candidate] = []
+        self._warm = np.zeros((0, 7))  # mean features of the clusters in the frame before
         self._before: tuple[Head, Future[Array]] | None = None
         self._beside = ThreadPoolExecutor(1, "visfuse-depth")
 
-    def _rectified(self, size: tuple[int, int]) -> tuple[tuple[Array, Array], tuple[Array, Array], Array, Array]:
+    def _rectified(self, size: tuple[int, int]) -> tuple[list[tuple[Array, Array]], float, Array, Array]:
+        """Maps of both views to rows that agree, their focal length, where (H, W, 2) the left view's pixels then lie,
+        and the depth (H, W) there of a point one metre before the left view.
+        """
         rig = self._rig
         none = np.zeros(5)
-        R1, R2, P1, _, _, _, _ = cv2.stereoRectify(rig.left.K, none, rig.right.K, none, size, rig.R, rig.T, alpha=0)
+        R1, R2, P1, _, _, _, _ = cv2.stereoRectify(
+            rig.left.K, none, rig.right.K, none, size, rig.R, rig.T[:, None], alpha=0
+        )
         maps = [
             cv2.initUndistortRectifyMap(K, none, R, P1[:, :3], size, cv2.CV_32FC1)
             for K, R in ((rig.left.K, R1), (rig.right.K, R2))
         ]
-        return maps[0], maps[1], R1, P1[:, :3]
+        u, v = np.meshgrid(np.arange(size[0], dtype=float), np.arange(size[1], dtype=float))
+        rays = np.stack([u, v, np.ones_like(u)], axis=-1) @ np.linalg.inv(rig.left.K).T @ R1.T
+        at = rays @ P1[:, :3].T
+        return maps, float(P1[0, 0]), (at[..., :2] / at[..., 2:]).astype(np.float32), np.maximum(rays[..., 2], 1e-6)
 
     def _depth(self, left: Image, right: Image) -> Array:
         """Depth (H, W) m of the left view; infinite where nothing is known."""
@@ -73,23 +84,21 @@ class Finder:
             disparity = self._matched(left, right)
             focal = self._rig.left.K[0, 0]
             return np.where(disparity > 0.5, focal * self._rig.baseline / np.maximum(disparity, 0.5), np.inf)
-        one, other, R1, K = self._maps
-        pair = [cv2.remap(view, *maps, cv2.INTER_LINEAR) for view, maps in ((left, one), (right, other))]
+        maps, focal, at, share = self._maps
+        pair = [cv2.remap(view, *own, cv2.INTER_LINEAR) for view, own in zip((left, right), maps, strict=True)]
         disparity = self._matched(*pair)
-        depth = np.where(disparity > 0.5, K[0, 0] * self._rig.baseline / np.maximum(disparity, 0.5), np.inf)
-        # Back to the left view: where each of its pixels lies in the rectified picture.
-        high, wide = depth.shape
-        u, v = np.meshgrid(np.arange(wide, dtype=float), np.arange(high, dtype=float))
-        rays = np.stack([u, v, np.ones_like(u)], axis=-1) @ np.linalg.inv(self._rig.left.K).T @ R1.T
-        at = rays @ K.T
-        at = (at[..., :2] / at[..., 2:]).astype(np.float32)
-        near = cv2.remap(depth.astype(np.float32), at[..., 0], at[..., 1], cv2.INTER_NEAREST, borderValue=np.inf)
-        return np.asarray(near / np.maximum(rays[..., 2], 1e-6), dtype=float)
+        depth = np.where(disparity > 0.5, focal * self._rig.baseline / np.maximum(disparity, 0.5), np.inf)
+        near = cv2.remap(depth.astype(np.float32), at, None, cv2.INTER_NEAREST, borderValue=np.inf)
+        return np.asarray(near / share, dtype=float)
 
     def _matched(self, left: Image, right: Image) -> Array:
         """Disparity (H, W) px; the matcher leaves out as many columns as it tries disparities, so it gets them more."""
         more = [cv2.copyMakeBorder(view, 0, 0, self._disparities, 0, cv2.BORDER_REPLICATE) for view in (left, right)]
         return np.asarray(self._matcher.compute(*more)[:, self._disparities :].astype(np.float32) / 16, dtype=float)
+
+    def rest(self) -> None:
+        """Nothing is looked for in this frame."""
+        self._before, self._candidates = None, []
 
     def look(self, pair: Pair, grey: Image, known: list[Array]) -> list[Found]:
         """What moved for some frames in the left view and is none of the `known` boxes [x, y, w, h]."""
@@ -105,7 +114,7 @@ class Finder:
             low = np.maximum(box[:2] - AROUND * box[2:], 0).astype(int)
             top = np.maximum(box[:2] + (1 + AROUND) * box[2:] + 1, 0).astype(int)
             mask[low[1] : top[1], low[0] : top[0]] = 0
-        regions = self._regions(mask, rest, pair.pictures["left"])
+        regions = self._whole(self._regions(mask, rest, pair.pictures["left"]), depth, rest)
         return self._confirmed(regions, depth, rest, pair.flow, pair.head.t - head.t, pair.head)
 
     def _moving(self, depth: Array, flow: Array, before: Head, now: Head) -> tuple[Image, Array]:
@@ -140,7 +149,10 @@ class Finder:
         weights = clusters.WEIGHTS.copy()
         if np.ptp(picture[v, u].astype(int), axis=1).max() < 4:
             weights[4:] = 1e-3  # grey footage: one brightness told thrice
-        labels = clusters.segmented(clusters.whitened(features, weights), settings.most, settings.clusters)
+        white = clusters.whitened(np.concatenate([features, self._warm]), weights)
+        points, warm = white[: len(features)], white[len(features) :]
+        labels = clusters.segmented(points, settings.most, settings.clusters, warm)
+        self._warm = np.array([features[labels == label].mean(axis=0) for label in np.unique(labels)])
         found = []
         for label in np.unique(labels):
             own = np.zeros_like(mask)
@@ -151,6 +163,36 @@ class Finder:
                 if area >= least and area > FILLED * w * h and min(w, h) >= 8:
                     found.append((np.array([x - 0.5, y - 0.5, x + w - 0.5, y + h - 0.5]), parts == k))
         return found
+
+    def _whole(self, regions: list[tuple[Array, Array]], depth: Array, rest: Array) -> list[tuple[Array, Array]]:
+        """Regions side by side that are as far away and move alike, joined: the colours of one thing differ."""
+        regions, k = list(regions), 0
+        while k < len(regions):
+            box, own = regions[k]
+            other = next(
+                (j for j in range(k + 1, len(regions)) if self._one(regions[k], regions[j], depth, rest)), None
+            )
+            if other is None:
+                k += 1
+                continue
+            more, its = regions.pop(other)
+            regions[k] = (
+                np.append(np.minimum(box[:2], more[:2]), np.maximum(box[2:], more[2:])),
+                np.logical_or(own, its),
+            )
+            k = 0
+        return regions
+
+    def _one(self, first: tuple[Array, Array], second: tuple[Array, Array], depth: Array, rest: Array) -> bool:
+        (box, own), (other, its) = first, second
+        gap = np.maximum(box[:2], other[:2]) - np.minimum(box[2:], other[2:])
+        if np.any(gap > NEAR * np.minimum(box[2:] - box[:2], other[2:] - other[:2]).max()):
+            return False
+        fb = self._rig.left.K[0, 0] * self._rig.baseline
+        one, two = (fb / float(np.median(depth[mask])) for mask in (own, its))
+        here, there = (np.median(rest[mask], axis=0) for mask in (own, its))
+        alike = np.linalg.norm(here - there) < max(0.7, 0.4 * float(np.linalg.norm(here)))
+        return bool(abs(one - two) < max(1.0, 0.12 * one) and alike)
 
     def _confirmed(
         self, regions: list[tuple[Array, Array]], depth: Array, rest: Array, flow: Array, dt: float, now: Head
@@ -165,16 +207,27 @@ class Finder:
             before = next((c for c in self._candidates if _shared(c.box, box) > 0.4), None)
             alike = before is not None and float(before.motion @ motion) > 0
             candidate = _Candidate(box, before.seen + 1 if before is not None and alike else 1, motion)
-            u0, v0, u1, v1 = box
-            unseen = self._rig.left.K[0, 0] * self._rig.baseline / away  # px at the left that the right view lacks
-            cut = u0 < unseen + RIM or u1 > rest.shape[1] - 1 - RIM  # it is coming in, or going out
-            if candidate.seen >= self._config.life.confirm_frames and not cut:
+            if candidate.seen >= self._config.life.confirm_frames and not self._cut(box, depth, away):
                 u0, v0, u1, v1 = self._tight(box, depth, away, flow)
                 ready.append(Found(np.array([[u0, v0], [u1, v0], [u1, v1], [u0, v1]]), velocity, away))
             else:
                 kept.append(candidate)
         self._candidates = kept
         return ready
+
+    def _cut(self, box: Array, depth: Array, away: float) -> bool:
+        """Whether a thing in a box [u0, v0, u1, v1] is partly out of view, or behind something."""
+        own = self._rig.left.K[0, 0] * self._rig.baseline / away  # px at the left that the right view lacks
+        if box[0] < own + RIM or box[2] > depth.shape[1] - 1 - RIM:
+            return True
+        strip = max(BESIDE * (box[2] - box[0]), 2 * RIM)
+        rows = slice(int(0.8 * box[1] + 0.2 * box[3]), int(0.2 * box[1] + 0.8 * box[3]) + 1)
+        for edge in (box[0] - strip, box[2]):
+            beside = depth[rows, max(int(edge), 0) : int(edge + strip) + 1]
+            nearer = self._rig.left.K[0, 0] * self._rig.baseline / beside > own + max(1.0, 0.15 * own)
+            if np.mean(nearer) > 0.5:
+                return True
+        return False
 
     def _tight(self, box: Array, depth: Array, away: float, flow: Array) -> Array:
         """The box [u0, v0, u1, v1] no wider than what lies as far away, `away` m: flow alone runs over outlines.

@@ -28,7 +28,8 @@ REACH = 3.0  # px of disparity around the expected one, at least
 HIDDEN = 0.2  # share of a target's box that others cover: from there on it is not looked for
 FLOW_RIM = 4.0  # px from the edge of the picture, within which there is no saying what its flow is
 COASTED_S = 0.25  # after which a target that is found again must look as it did
-ALIKE = 45.0  # grey levels: looks that differ by less may be of one thing
+FASTER, FAST, SLACK_M = 2.0, 1.5, 0.5  # times its pace, m/s, m: how far a lost target may have come
+ALIKE = 30.0  # grey levels: looks that differ by less may be of one thing
 KEEP_LOOKS = 0.95  # of what a target looked like, from frame to frame
 
 
@@ -100,6 +101,7 @@ class Target:
     history: list[Seen] = field(default_factory=list)
     ended_by: str = ""
     away: float = 0.0  # m that the camera moved since the target began
+    alone_at: float = 0.0  # s: when last no other target was where this one is
     earlier: Target | None = None
 
     @property
@@ -143,7 +145,7 @@ def start(
     cov = sigma**2 * np.outer(rays, rays) + (0.005 * place[2]) ** 2 * np.eye(3)
     bank = models.start(Gaussian(head.outside(place), head.R @ cov @ head.R.T), velocity)
     sought, seen = patches.holding(pair.levels, left), looks(pair.pictures["left"], left)
-    target = Target(identity, rig, config, models, bank, size, sought, seen, head, given, head.t)
+    target = Target(identity, rig, config, models, bank, size, sought, seen, head, given, head.t, alone_at=head.t)
     nothing = np.zeros_like(bank.beliefs.cov)
     first = Step(bank.beliefs, nothing + np.eye(SIZE), nothing, bank.beliefs, bank.log_mu, bank)
     boxes = {"left": box_of(left), "right": box_of(right)}
@@ -202,8 +204,17 @@ def alike(target: Target, pair: Pair, quad: Array) -> bool:
 
 
 def found_again(target: Target, pair: Pair, middle: Array, depth: float) -> Array | None:
-    """The left quad (4, 2) of a target that was lost, around a pixel (2,) at a depth (m); None where it is not it."""
+    """The left quad (4, 2) of a target that was lost, around a pixel (2,) at a depth (m); None where it is not it.
+
+    It does not look like it, or cannot have come there.
+    """
     focal = np.diag(target.rig.left.K)[:2]
+    place = pair.head.outside(depth * (np.linalg.inv(target.rig.left.K) @ np.append(middle, 1.0)))
+    last = next(seen for seen in target.history[::-1] if seen.measured)
+    then = imm.combined(last.step.filtered).mean
+    pace = max(FASTER * float(np.linalg.norm(then[V])), FAST)
+    if np.linalg.norm(place - then[P]) > 0.1 * depth + SLACK_M + pace * (pair.head.t - last.t):
+        return None
     half = target.size * focal / depth / 2
     quad = middle + half * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1.0]])
     moved = patches.searched(pair.levels[0], quad, target.sought, patches.SEARCH, target.config.measure.good)

@@ -17,6 +17,8 @@ from visfuse_cli.vision import flow as optical
 from visfuse_cli.vision import patches
 from visfuse_cli.vision.epipolar_match import match
 
+# Two targets that share so much of a box, are so near (m), and go so much alike (m/s) for so long (s) are one.
+TWINS_SHARE, TWINS_M, TWINS_SPEED, TWINS_S = 0.25, 0.6, 0.4, 0.4
 SMALL_LINES = 480  # up to which Horn-Schunck is the default
 Stage = Callable[[str], AbstractContextManager[None]]
 
@@ -29,7 +31,7 @@ class Tracker:
     ) -> None:
         self._rig, self._config, self._size, self._stage = rig, config, size, stage
         self._models = Models(config.filter)
-        self._finder = None if given else Finder(rig, config, size)
+        self._finder, self._given = Finder(rig, config, size), bool(given)
         self._waiting = sorted(enumerate(given, start=1), key=lambda pair: pair[1].frame)
         self._followed: list[Target] = []
         self._gone: list[Target] = []  # but remembered: they may come back
@@ -47,14 +49,17 @@ class Tracker:
         pair = Pair(frame, head, pictures, levels, flow)
         with self._stage("filter"):
             self._follow(pair)
+        self._followed = [each for each in self._followed if not self._twin(each, head.t)]
         self._gone += [each for each in self._followed if self._over(each, head.t)]
         self._followed = [each for each in self._followed if not each.ended_by]
         self._begin_given(pair)
-        if self._finder is not None:
+        if not self._given or self._gone or self._lost(head.t):
             with self._stage("newcomers"):
                 boxes = [each.history[-1].boxes["left"] for each in self._followed if each.history[-1].boxes]
                 found = self._finder.look(pair, grey, boxes)
             self._begin_found(found, pair)
+        else:
+            self._finder.rest()
         self._before = (head, grey)
         over = [each for each in self._gone if head.t - each.last_seen > self._config.life.memory_s]
         self._gone = [each for each in self._gone if each not in over]
@@ -100,9 +105,11 @@ class Tracker:
         for each in found:
             velocity = Gaussian(each.velocity, self._config.filter.start_speed**2 * np.eye(3))
             old, quad = self._known(each, pair)
+            if old is None and self._given:
+                continue  # who is followed was said
             right = self._match(pair, quad)
-            identity = self._next_id if old is None else old.id
-            new = None if right is None else self._started(identity, pair, quad, right, velocity, False)
+            identity, given = (self._next_id, False) if old is None else (old.id, old.given)
+            new = None if right is None else self._started(identity, pair, quad, right, velocity, given)
             if new is None:
                 continue
             if old is None:
@@ -115,12 +122,27 @@ class Tracker:
 
     def _known(self, found: Found, pair: Pair) -> tuple[Target | None, Array]:
         """Who of those that are lost or away was found, and where (4, 2) px; else nobody, and the quad as it is."""
-        lost = [each for each in self._followed if pair.head.t - each.last_seen > one.COASTED_S]
-        for old in sorted([*lost, *self._gone], key=lambda each: -each.last_seen):
+        for old in sorted([*self._lost(pair.head.t), *self._gone], key=lambda each: -each.last_seen):
             quad = one.found_again(old, pair, found.quad.mean(axis=0), found.depth)
             if quad is not None:
                 return old, quad
         return None, found.quad
+
+    def _twin(self, target: Target, t: float) -> bool:
+        """Whether a target that was found has for some time been where an older one is, and gone as that goes."""
+        own, belief = target.history[-1].boxes.get("left"), target.belief
+        near = False
+        for other in self._followed[: self._followed.index(target)]:
+            box, there = other.history[-1].boxes.get("left"), other.belief
+            if own is None or box is None or max(covered(own, box), covered(box, own)) < TWINS_SHARE:
+                continue
+            away = float(np.linalg.norm(belief.mean[:3] - there.mean[:3]))
+            near |= away < TWINS_M and float(np.linalg.norm(belief.mean[3:6] - there.mean[3:6])) < TWINS_SPEED
+        target.alone_at = target.alone_at if near else t
+        return not target.given and t - target.alone_at > TWINS_S
+
+    def _lost(self, t: float) -> list[Target]:
+        return [each for each in self._followed if t - each.last_seen > one.COASTED_S]
 
     def _match(self, pair: Pair, quad: Array) -> Array | None:
         """The right quad (4, 2) of a left one, over all depths."""

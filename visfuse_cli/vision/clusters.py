@@ -9,6 +9,7 @@ from visfuse_cli.records import Array
 
 WEIGHTS = np.array([1.0, 1, 1, 1, 2, 2, 2])  # of [vx, vy, x, y, R, G, B]: Jia 2008, eq. 2
 ROUNDS = 30
+APART = 0.25  # validity ratio of clusters that stand apart
 
 
 def whitened(features: Array, weights: Array = WEIGHTS) -> Array:
@@ -40,23 +41,33 @@ def kmeans(points: Array, centres: Array) -> tuple[NDArray[np.intp], Array]:
     return labels, centres
 
 
-def segmented(points: Array, most: int, count: int | None) -> NDArray[np.intp]:
+def segmented(points: Array, most: int, count: int | None, warm: Array | None = None) -> NDArray[np.intp]:
     """Labels (n,) of points (n, d) in `count` clusters, or in as many as the validity ratio asks for, up to `most`.
 
     Ray and Turi: the mean squared distance within clusters over the least one between their centres. One cluster is
-    kept where two or more do not stand well apart.
+    kept where two or more do not stand well apart. From `warm` centres (k, d) of the frame before no other number is
+    tried as long as these still stand apart.
     """
-    best, labels = 0.25, np.zeros(len(points), dtype=np.intp)
+    if warm is not None and len(warm) > 1 and len(points) >= 8 * len(warm) and count in (None, len(warm)):
+        labels, ratio = _tried(points, warm)
+        if ratio < APART:
+            return labels
+    best, labels = APART, np.zeros(len(points), dtype=np.intp)
     for k in [count] if count is not None else range(2, most + 1):
         if len(points) < 8 * k:
             break
-        found, centres = kmeans(points, _spread(points, k))
-        within = float(np.mean(np.sum((points - centres[found]) ** 2, axis=1)))
-        between = np.sum((centres[:, None] - centres[None]) ** 2, axis=-1)[np.triu_indices(k, 1)]
-        ratio = within / float(between.min()) if k > 1 else 0.0
+        found, ratio = _tried(points, _spread(points, k))
         if count is not None or ratio < best:
             best, labels = ratio, found
     return labels
+
+
+def _tried(points: Array, centres: Array) -> tuple[NDArray[np.intp], float]:
+    """Labels (n,) of K-means from those centres (k, d), and the validity ratio."""
+    labels, centres = kmeans(points, centres)
+    within = float(np.mean(np.sum((points - centres[labels]) ** 2, axis=1)))
+    between = np.sum((centres[:, None] - centres[None]) ** 2, axis=-1)[np.triu_indices(len(centres), 1)]
+    return labels, within / max(float(between.min()), 1e-12) if len(centres) > 1 else 0.0
 
 
 def _spread(points: Array, k: int) -> Array:
