@@ -37,12 +37,16 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seeds", type=int, default=10)
     parser.add_argument("--keep", type=Path)
+    parser.add_argument("--causal", action="store_true", help="every model on the turn without the backward pass, too")
     parser.add_argument("--only", nargs="*", choices=PARTS, default=PARTS)
     args = parser.parse_args()
     with tempfile.TemporaryDirectory() as temporary:
         folder = args.keep or Path(temporary)
         for part in args.only:
-            globals()[part](folder, args.seeds)
+            if part == "visits":
+                visits(folder, args.seeds, ("smooth=true", "smooth=false") if args.causal else ("smooth=true",))
+            else:
+                globals()[part](folder, args.seeds)
 
 
 def rendered(folder: Path, write: Callable[[Path], None]) -> Path:
@@ -117,11 +121,9 @@ def turning(true: dict[int, Array], frames: list[int], fps: float = 15.0) -> NDA
     return np.array([rate[k] > TURNING for k in frames])
 
 
-def visits(folder: Path, seeds: int) -> None:
-    print(
-        f"\n{'visit':<7} {'':<5} {'tracks':>6} {'frames':>8} {'RMSE m':>7} {'% range':>8} {'speed m/s':>9}   turn RMS m"
-    )
-    turns: dict[str, list[Array]] = {name + mode: [] for name in MODELS for mode in ("", "/causal")}
+def visits(folder: Path, seeds: int, modes: tuple[str, ...]) -> None:
+    print(f"\n{'visit':<7} {'':<5} {'tracks':>6} {'frames':>8} {'RMSE m':>7} {'% range':>8} {'speed m/s':>9}")
+    turns: dict[str, list[Array]] = {name + mode: [] for name in MODELS for mode in modes}
     worst = np.zeros(2)
     for seed in range(seeds):
         scene = rendered(folder / f"visit{seed}", lambda out, seed=seed: write_head(visit(seed), out, init=True))
@@ -134,17 +136,17 @@ def visits(folder: Path, seeds: int) -> None:
             speed = rms(off[:, 3:])
             worst = np.maximum(worst, [share, speed])
             row = f"{len(tracks):6d} {len(frames):4d}/{len(true):<3d} {rms(off[:, :3]):7.3f} {share:8.2f} {speed:9.3f}"
-            print(f"{seed:<7} {name:<5} {row}")
+            print(f"{seed:<7} {name:<5} {row}", flush=True)
         for name in MODELS:
-            for mode, options in (("", []), ("/causal", ["--set", "smooth=false"])):
-                tracks = wheels(scene, "--set", f"filter.kind={name}", *options)[0]["tracks"]
+            for mode in modes:
+                tracks = wheels(scene, "--set", f"filter.kind={name}", "--set", mode)[0]["tracks"]
                 if tracks:
                     frames, off, _ = errors(tracks[0], true, 3)
                     turns[name + mode].append(off[turning(true, frames), :3])
     print(f"worst: {worst[0]:.2f} % of the range, {worst[1]:.3f} m/s")
-    for mode in ("", "/causal"):
+    for mode in modes:
         values = {name: rms(np.concatenate(turns[name + mode])) for name in MODELS}
-        print(f"on the turn{mode}, RMS m: " + ", ".join(f"{name} {value:.4f}" for name, value in values.items()))
+        print(f"on the turn, {mode}, RMS m: " + ", ".join(f"{name} {value:.4f}" for name, value in values.items()))
 
 
 def crossings(folder: Path, seeds: int) -> None:
