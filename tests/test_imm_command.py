@@ -130,6 +130,21 @@ def test_a_parked_car_stands_still_while_the_camera_drives(tmp_path):
     assert np.linalg.norm(places - np.median(places, axis=0), axis=1).max() < 1.0
 
 
+def test_two_who_cross_keep_their_identities(tmp_path):
+    out = tmp_path / "crossing"
+    write_head(room(1, people=2, seconds=4.0, size=(192, 164)), out, init=True)
+    done = run(out, *WHEELS, "--out", tmp_path / "run", "--no-video", "--no-report")
+    assert done.returncode == 0, done.stderr
+    with open(out / "truth.csv", newline="", encoding="utf-8") as file:
+        truth = {(int(r["id"]), int(r["frame"])): [float(r[k]) for k in "xyz"] for r in csv.DictReader(file)}
+    assert [track["id"] for track in tracks(tmp_path / "run")] == [1, 2]
+    for track in tracks(tmp_path / "run"):
+        states = [s for s in track["states"] if (track["id"], s["frame"]) in truth]
+        off = [np.subtract(s["position"], truth[track["id"], s["frame"]]) for s in states]
+        assert len(off) > 30
+        assert np.linalg.norm(off, axis=1).max() < 0.25
+
+
 BAD = {
     "no sensors": (None, "has no sensors"),
     "empty sensors": ("", "is empty"),

@@ -30,6 +30,7 @@ FLOW_RIM = 4.0  # px from the edge of the picture, within which there is no sayi
 COASTED_S = 0.25  # after which a target that is found again must look as it did
 FASTER, FAST, SLACK_M = 2.0, 1.5, 0.5  # times its pace, m/s, m: how far a lost target may have come
 ALIKE = 30.0  # grey levels: looks that differ by less may be of one thing
+SETTLED_S = 0.4  # s after it was found again, from which on its template is taken anew: it comes out bit by bit
 KEEP_LOOKS = 0.95  # of what a target looked like, from frame to frame
 
 
@@ -101,6 +102,7 @@ class Target:
     history: list[Seen] = field(default_factory=list)
     ended_by: str = ""
     away: float = 0.0  # m that the camera moved since the target began
+    seen_since: float = -np.inf  # s: since when it is seen without a break
     alone_at: float = 0.0  # s: when last no other target was where this one is
     earlier: Target | None = None
 
@@ -189,6 +191,7 @@ def follow(target: Target, pair: Pair, expected: Expected, hidden: float) -> Non
             step, nis = updated
             target.bank = step.filtered
             measured, quads = True, {"left": left, "right": right}
+            target.seen_since = target.seen_since if target.history[-1].measured else head.t
             target.last_seen = head.t
             _refresh(target, pair, left, alignment)
     boxes = {view: box_of(quad) for view, quad in quads.items()}
@@ -316,7 +319,7 @@ def _refresh(target: Target, pair: Pair, left: Array, found: Alignment) -> None:
     size = np.array(patches.side(left)) * place[2] / np.diag(target.rig.left.K)[:2]
     target.size = target.size + 0.1 * (np.clip(size, 0.8 * target.size, 1.25 * target.size) - target.size)
     target.looks = KEEP_LOOKS * target.looks + (1 - KEEP_LOOKS) * looks(pair.pictures["left"], left)
-    if found.correlation < target.config.measure.fresh:
+    if found.correlation < target.config.measure.fresh and pair.head.t - target.seen_since > SETTLED_S:
         target.sought = patches.holding(pair.levels, left)
 
 

@@ -18,7 +18,7 @@ from visfuse_cli.vision import patches
 from visfuse_cli.vision.epipolar_match import match
 
 # Two targets that share so much of a box, are so near (m), and go so much alike (m/s) for so long (s) are one.
-TWINS_SHARE, TWINS_M, TWINS_SPEED, TWINS_S = 0.25, 0.6, 0.4, 0.4
+TWINS_SHARE, TWINS_M, TWINS_SPEED, TWINS_S = 0.25, 0.45, 0.4, 0.4
 SMALL_LINES = 480  # up to which Horn-Schunck is the default
 Stage = Callable[[str], AbstractContextManager[None]]
 
@@ -134,7 +134,7 @@ class Tracker:
         near = False
         for other in self._followed[: self._followed.index(target)]:
             box, there = other.history[-1].boxes.get("left"), other.belief
-            if own is None or box is None or max(covered(own, box), covered(box, own)) < TWINS_SHARE:
+            if own is None or box is None or covered(own, _grown(box)) < TWINS_SHARE:
                 continue
             away = float(np.linalg.norm(belief.mean[:3] - there.mean[:3]))
             near |= away < TWINS_M and float(np.linalg.norm(belief.mean[3:6] - there.mean[3:6])) < TWINS_SPEED
@@ -162,6 +162,11 @@ class Tracker:
         elif box is None or np.any(box[:2] + box[2:] / 2 < 0) or np.any(box[:2] + box[2:] / 2 > self._size):
             target.ended_by = "left"
         return bool(target.ended_by)
+
+
+def _grown(box: Array) -> Array:
+    """A box [x, y, w, h] and a third of it to both sides."""
+    return box + np.array([-1 / 3, 0, 2 / 3, 0]) * box[2]
 
 
 def covered(box: Array, other: Array) -> float:

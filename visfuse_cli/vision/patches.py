@@ -18,6 +18,7 @@ ROUNDS = 20
 FEWEST, MOST = 10, 72  # samples along a side of a patch that is aligned
 HUBER = 2.5
 LONGEST = 30000  # rows of a picture that remap makes
+EDGE = 2.0  # px within the picture, so that a patch can be shifted
 VISIBLE = 0.6  # share of a patch that must be in the picture
 SEARCH = 0.8  # of its size: how far around the prediction a lost target is looked for
 PLAIN = 4.0  # grey levels: differences of neighbouring samples of a patch without edges are smaller
@@ -121,7 +122,7 @@ def visible(sought: Template, quad: Array, size: tuple[int, int]) -> Template | 
         return None
     at = warped(quad, sought.unit)
     shape = _count(sought.unit)[::-1]
-    there = np.all((at > 0) & (at < np.array(size) - 1), axis=-1).reshape(shape)
+    there = np.all((at > EDGE) & (at < np.array(size) - 1 - EDGE), axis=-1).reshape(shape)
     kept = np.outer(there.any(axis=1), there.any(axis=0)).ravel()
     if np.count_nonzero(kept) < VISIBLE * len(kept):
         return None
