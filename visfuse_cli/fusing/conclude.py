@@ -23,6 +23,7 @@ from visfuse_cli.records import Array, Gaussian
 DENIED = 1  # camera or more with a clear sight that speak against a prediction
 BODY_SIGMA = 0.0035  # m, times the root of the noise found: what cameras err alike, as by feet that point ahead
 UPRIGHT_SIGMA = 0.006  # m: heads are not as round as they are taken to be, nor is the ground as flat
+EDGE_PX = 0.3  # px: what half of the height is uncertain by, as silhouettes end between pixels
 START_DOUBT = 2.0  # times the deviations a track began with
 
 
@@ -80,7 +81,7 @@ def conclude(person: Person, P: Array, config: FuseConfig) -> Path | None:
         pixels, J = project(P[sights.camera], belief.mean[sights.owner, :3])
     cov = belief.cov.copy()
     cov[:, :3, :3] += BODY_SIGMA**2 * noise * np.eye(3) + _by_body(sights, J, lever, person.body.ends.cov, len(t))
-    cov[:, 2, 2] += UPRIGHT_SIGMA**2
+    cov[:, 2, 2] += UPRIGHT_SIGMA**2 + (EDGE_PX / float(np.median(np.linalg.norm(J[:, :, 2], axis=1)))) ** 2
     belief = Gaussian(belief.mean, cov)
     residual = np.full((*seen.shape, 2), np.nan)
     residual[sights.owner, sights.camera] = sights.z - pixels

@@ -16,7 +16,7 @@ class PersonSettings(Section):
     height: float = Field(1.72, gt=0.3, le=3, description="m: usual height")
     height_sigma: float = Field(0.12, gt=0, le=1, description="m: how much people differ from it")
     width: float = Field(0.55, gt=0.1, le=2, description="m: usual width across, arms included")
-    shortest: float = Field(1.2, gt=0.2, le=3, description="m: what is lower is no person")
+    shortest: float = Field(1.0, gt=0.2, le=3, description="m: what is lower is no person")
     tallest: float = Field(2.3, gt=0.3, le=4, description="m: what is higher is no person")
 
     @model_validator(mode="after")

@@ -14,6 +14,7 @@ from visfuse_cli.vision.background import FOREGROUND
 SIDEWAYS_M, UPWARDS_M = 0.3, 0.25  # how far around the expected box a person's pixels are looked for
 LEAST_ROW, LEAST_COLUMN = 0.10, 0.05  # share of the width, of the height, that a side's row or column holds
 BEYOND_PX = 4  # px outside of a side that tell whether something else begins there
+PARTLY_PX = 0.4  # px that a silhouette reaches too far: pixels that are covered in part count as a whole
 LEAST_ROWS = 0.25  # share of a person's rows that must tell where its side is
 TOUCHING = 0.35  # share of a side with something else beyond it: then it is nobody's own side
 FRONT = 1.0  # lateral distance, in half widths, within which the nearer person hides the other
@@ -87,7 +88,8 @@ def sides(mask: Image, expected: Expected, who: int) -> Sides | None:
     if len(across) < 2 or len(down) < 3:
         return None
     u0, u1, v0, v1 = int(across[0]), int(across[-1]) + 1, int(down[0]), int(down[-1]) + 1
-    found = np.array([left + u0, top + v0, left + u1, top + v1]) - 0.5  # a pixel reaches half of one to each side
+    # A pixel reaches half of one to each side, and at a border it is new as soon as a part of it is.
+    found = np.array([left + u0, top + v0, left + u1, top + v1]) - 0.5 + PARTLY_PX * np.array([1, 1, -1, -1])
     other = part.astype(bool) & ~own
     return Sides(
         found,
