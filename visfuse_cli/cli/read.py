@@ -93,6 +93,8 @@ def summary(
     zone: Annotated[str, typer.Option("--zone", help="Time zone of hours and days, like Europe/Vienna.")] = "UTC",
     form: Annotated[str, typer.Option("--format", metavar="FORM", help="table, csv, json or parquet.")] = "table",
     out: Annotated[Path | None, typer.Option("--out", metavar="FILE", help="To a file instead of the screen.")] = None,
+    as_json: JsonOption = False,
+    quiet: QuietOption = False,
 ) -> None:
     """What a traffic log says: counts, mean, 50th and 85th percentile with intervals, pace, share above a limit.
 
@@ -102,6 +104,8 @@ def summary(
 
     if by not in (None, *BY):
         raise UsageError(f"--by {by}: one of {', '.join(BY)}")
+    if as_json:
+        form = "json"
     if form not in FORMS:
         raise UsageError(f"--format {form}: one of {', '.join(FORMS)}")
     if form == "parquet" and out is None:
@@ -115,7 +119,7 @@ def summary(
         from visfuse_cli.files.atomic import write_text
 
         write_text(out, command.as_text(found, form) + "\n")  # type: ignore[arg-type]
-    else:
+    elif form != "table" or not (quiet or voice.quiet):
         typer.echo(command.as_text(found, form))  # type: ignore[arg-type]
 
 

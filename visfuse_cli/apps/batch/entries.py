@@ -52,6 +52,12 @@ class SpeedEntry(TrackingEntry):
     log: str | None = None
 
 
+class ImmEntry(TrackingEntry):
+    """`visfuse track-imm`."""
+
+    homography: str | None = None
+
+
 class FuseEntry(TrackingEntry):
     """`visfuse fuse-cameras`."""
 
@@ -73,7 +79,7 @@ class CalibrateEntry(Entry):
 
 ENTRIES: dict[str, type[Entry]] = {
     "speed": SpeedEntry,
-    "track-imm": TrackingEntry,
+    "track-imm": ImmEntry,
     "track-stereo-pf": TrackingEntry,
     "fuse-cameras": FuseEntry,
     "calibrate-homography": CalibrateEntry,
