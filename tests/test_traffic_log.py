@@ -282,7 +282,7 @@ def test_a_writer_killed_in_a_transaction_leaves_the_log_whole(week):
 
 def _visfuse(*args):
     return subprocess.run(
-        [sys.executable, "-m", "visfuse_cli", *map(str, args)], capture_output=True, text=True, timeout=120
+        [sys.executable, "-m", "visfuse_cli", *map(str, args)], capture_output=True, text=True, timeout=600
     )
 
 

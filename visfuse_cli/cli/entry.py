@@ -53,6 +53,8 @@ def main() -> None:
             stream.reconfigure(errors="backslashreplace")  # a path may hold bytes that no terminal can show
     if not sys.warnoptions:
         warnings.simplefilter("ignore")  # of libraries, about numbers that the results are checked for
+    if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
     signal.signal(signal.SIGTERM, _terminate)
     try:
         code = app(standalone_mode=False)
