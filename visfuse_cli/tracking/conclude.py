@@ -50,7 +50,8 @@ class Path:
     nis: Array
     nis_dof: int  # numbers in a measurement
     refused: int
-    likeness: float  # mean share of the outline that was found
+    likeness: float  # mean share of the outline that was found, of what could be
+    support: float  # the same, of all of it: what is hidden, out of the picture or amidst others counts
     misfit_px: float
     ended_by: str
     ahead: Array  # (T, 2) m: where it was expected a latency later, from what was known then
@@ -102,6 +103,7 @@ def conclude(track: Track, camera: GroundCamera, settings: TrackerSettings, dyna
         nis_dof=len(dynamics.H),
         refused=track.refused,
         likeness=float(np.nanmean([s.border for s in samples if s.measured])),
+        support=float(np.mean([s.outline.tangent or s.outline.valid.mean() for s in samples if s.measured])),
         misfit_px=misfit,
         ended_by=track.ended_by,
         ahead=_ahead(steps, dynamics, settings.latency, float(size[0])),

@@ -30,9 +30,12 @@ class SpeedSettings(Section):
     max_sigma: float = Field(0.15, gt=0, le=10, description="standard deviation over speed: above, too uncertain")
     max_acceleration: float = Field(9.0, gt=0, le=100, description="m/s^2: above, the track has jumped")
     min_likeness: float = Field(
-        0.7, ge=0, le=1, description="least share of its outline that must be found, on average"
+        0.75, ge=0, le=1, description="least share of its outline that must be found, on average"
     )
     min_measured: float = Field(0.6, ge=0, le=1, description="share of a track's frames that must be measured")
+    min_support: float = Field(
+        0.45, ge=0, le=1, description="that share, times the share of its whole outline that was found, must reach"
+    )
     max_misfit: float = Field(0.2, gt=0, le=5, description="outline misfit over outline size: above, no such box")
     max_size_z: float = Field(4.0, gt=0, le=100, description="deviations of a size from its class")
     max_refused: float = Field(
@@ -141,6 +144,8 @@ def _reason(path: Path, verdict: Verdict, settings: SpeedSettings, trusted: bool
         return f"no {path.class_name} measures {length:.1f} x {width:.1f} x {height:.1f} m: a part, or several"
     if path.likeness < settings.min_likeness:
         return f"unlike a {path.class_name}: {100 * path.likeness:.0f} % of its outline was seen"
+    if path.likeness * path.support < settings.min_support:
+        return f"too little seen: {100 * path.support:.0f} % of a {path.class_name}'s whole outline"
     outline = _outline_px(path)
     if np.isfinite(path.misfit_px) and path.misfit_px > settings.max_misfit * outline + 3:
         return f"no box fits: outline off by {path.misfit_px:.0f} px (several vehicles, a shadow or a reflection)"
