@@ -6,8 +6,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from visfuse_cli.facing import free
 from visfuse_cli.facing.adjust import ALONG, RIGHT, SPEED, UP, Adjusted, Rules, Sightings, adjust, slopes
-from visfuse_cli.facing.target import FACING, LATERAL, VERTICAL, S, Target, V, drift
+from visfuse_cli.facing.front import FACING, LATERAL, VERTICAL, S, Target, V, drift
 from visfuse_cli.maths.paths import Way, through
 from visfuse_cli.maths.planes import in_right, projected, triangulated
 from visfuse_cli.records import Array, Gaussian
@@ -77,7 +78,7 @@ def _rules(target: Target, start: Array) -> Rules:
         vertical=max(min(vertical, most / 2), 1e-5),
         sigma_v=USUAL_SIGMA,
         relief=USUAL_RELIEF,
-        height=float(np.ptp(target.shape.corners[:, 2])),
+        height=float(np.linalg.norm(target.shape.corners[3] - target.shape.corners[0])),
         anchor=target.looks[0].quads["left"].mean(axis=0),
         pace=float(np.clip(speed / USUAL_SPEED, 0.01, 1.0)),
     )
@@ -216,22 +217,40 @@ def _motion(way: Way, place: Array) -> Array:
     return np.swapaxes((point[:, :3] - point[:, 3:]) / (2 * STEP), 1, 2)
 
 
+def mean_pair(speed: Array, sigma: Array, smooth: bool) -> tuple[float, float]:
+    """The speed of a track and its deviation: the mean of smoothed speeds (T,), the last of causal ones."""
+    if smooth:
+        return float(speed.mean()), float(sigma.mean())
+    return float(speed[-1]), float(sigma[-1])
+
+
 def _causal(target: Target, settled: Settled) -> Settled:
     """The particles' own output, instant by instant, in place of the smoothed states."""
     kept = [entry for entry in target.causal if entry[1] <= settled.t[-1] + 1e-9]
     mean = np.stack([belief.mean for _, _, belief, _ in kept])
-    order = [S, V, LATERAL, VERTICAL]
-    cov = np.stack([belief.cov for _, _, belief, _ in kept])[:, order][:, :, order]
-    place = mean[:, [S, LATERAL, VERTICAL]]
-    belief, stretch = _belief(target.way, place, mean[:, V], np.zeros((len(mean), 2)), cov)
+    cov = np.stack([belief.cov for _, _, belief, _ in kept])
+    if target.free:
+        order = free.KINEMATIC
+        belief = Gaussian(mean[:, order], cov[:, order][:, :, order] + 1e-9 * np.eye(6))
+    else:
+        order = [S, V, LATERAL, VERTICAL]
+        place = mean[:, [S, LATERAL, VERTICAL]]
+        still = np.zeros((len(mean), 2))
+        belief, _ = _belief(target.way, place, mean[:, V], still, cov[:, order][:, :, order])
+    speed = np.linalg.norm(belief.mean[:, 3:], axis=1)
+    along = belief.mean[:, 3:] / np.maximum(speed, 1e-9)[:, None]
+    sigma = np.sqrt(np.einsum("ta,tab,tb->t", along, belief.cov[:, 3:, 3:], along))
+    mean_speed, mean_sigma = mean_pair(speed, sigma, False)
     quads = {look.frame: look.quads for look in target.looks}
     return replace(
         settled,
         frame=[entry[0] for entry in kept],
         t=np.array([entry[1] for entry in kept]),
         belief=belief,
-        speed=np.abs(mean[:, V]) * stretch,
-        speed_sigma=np.sqrt(cov[:, 1, 1]) * stretch,
+        speed=speed,
+        speed_sigma=sigma,
+        mean_speed=mean_speed,
+        mean_sigma=mean_sigma,
         measured=np.array([entry[3] for entry in kept]),
         quads=[quads.get(entry[0], {}) for entry in kept],
     )

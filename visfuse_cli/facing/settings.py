@@ -16,7 +16,7 @@ class FilterSettings(Section):
     path_constraint: bool = Field(True, description="true: the vehicle keeps to its path; false: it moves freely")
     kind: Literal["particles", "triangulation"] = Field(
         "particles",
-        description="what is measured: the aligned patch; or, for comparison, its triangulated middle alone",
+        description="particles; or, for comparison, the triangulated middle of the patch and a Kalman filter",
     )
     sigma_v: float | None = Field(
         None, gt=0, le=50, description="m/s a frame at 5 frames/s: change of speed; empty: told by each track itself"

@@ -17,6 +17,7 @@ LEVELS = 5
 ROUNDS = 20
 FEWEST, MOST = 10, 72  # samples along a side of a patch that is aligned
 HUBER = 2.5
+CHUNK = 64  # poses that are sampled at once
 LONGEST = 30000  # rows of a picture that remap makes
 EDGE = 2.0  # px within the picture, so that a patch can be shifted
 VISIBLE = 0.6  # share of a patch that must be in the picture
@@ -39,7 +40,7 @@ def pyramid(image: Image) -> list[Grey]:
 
 def sampled(levels: list[Grey], points: Array, spacing: float) -> Grey:
     """Grey values (...) at pixels (..., 2), from the level whose pixels are as wide as `spacing` (px); 0 outside."""
-    level = int(np.clip(np.floor(np.log2(np.nan_to_num(max(spacing, 1.0), nan=1.0)) + 0.3), 0, len(levels) - 1))
+    level = _level(levels, spacing)
     at = (points / 2**level).astype(np.float32)
     flat = np.ascontiguousarray(at.reshape(-1, 2))
     # One row of the picture that is made for each pose.
@@ -50,13 +51,18 @@ def sampled(levels: list[Grey], points: Array, spacing: float) -> Grey:
     return np.concatenate(out).reshape(points.shape[:-1])
 
 
+def _level(levels: list[Grey], spacing: float) -> int:
+    """The level whose pixels are as wide as `spacing` (px)."""
+    return int(np.clip(np.floor(np.log2(max(spacing, 1.0)) + 0.3), 0, len(levels) - 1)) if np.isfinite(spacing) else 0
+
+
 def grid(count: tuple[int, int]) -> Array:
     """Middles (n, 2) of cells over the unit square, row by row."""
     u, v = np.meshgrid((np.arange(count[0]) + 0.5) / count[0], (np.arange(count[1]) + 0.5) / count[1])
     return np.column_stack([u.ravel(), v.ravel()])
 
 
-def warped(quads: Array, unit: Array) -> Array:
+def warped(quads: Array | Grey, unit: Array | Grey) -> Array:
     """Pixels (..., n, 2) of unit-square points (n, 2) in quads (..., 4, 2), clockwise from the top left: projective."""
     a, b, c, d = np.moveaxis(quads, -2, 0)
     p, q, r = b - c, d - c, a - b + c - d
@@ -64,9 +70,11 @@ def warped(quads: Array, unit: Array) -> Array:
     g = (r[..., 0] * q[..., 1] - r[..., 1] * q[..., 0]) / area
     h = (p[..., 0] * r[..., 1] - p[..., 1] * r[..., 0]) / area
     along, down = b - a + g[..., None] * b, d - a + h[..., None] * d
-    x, y = unit[:, 0, None], unit[:, 1, None]
-    top = along[..., None, :] * x + down[..., None, :] * y + a[..., None, :]
-    return np.asarray(top / (g[..., None, None] * x + h[..., None, None] * y + 1))
+    # homogeneous, across and down in rows of their own: one product for all points of all quads
+    M = np.stack([along, down, a], axis=-1)
+    flat = np.concatenate([unit, np.ones_like(unit[:, :1])], axis=-1).T
+    below = 1 + g[..., None] * unit[:, 0] + h[..., None] * unit[:, 1]
+    return np.asarray(np.moveaxis((M @ flat) / below[..., None, :], -2, -1))
 
 
 def side(quad: Array) -> tuple[float, float]:
@@ -254,23 +262,33 @@ def searched(level: Grey, quad: Array, sought: Template, reach: float, good: flo
     return np.asarray(quad + low + np.array(at) + (np.array(count) - 1) / 2 - quad.mean(axis=0))
 
 
-def part_values(levels: list[Grey], quads: Array) -> Array:
+def part_values(levels: list[Grey], quads: Array) -> Grey:
     """Cell values (P, cells) of the parts of quads (P, 4, 2): 10 parts of 4 x 4 cells, normalised in mean and contrast.
 
     In orthonormal form the distance of a part's 16 Haar-like values is that of its 16 cells. Zhu 2012, eq. 13.
     """
-    unit = grid((PARTS[0] * CELLS, PARTS[1] * CELLS))
-    some = [_spacing(quad, (PARTS[0] * CELLS, PARTS[1] * CELLS)) for quad in quads[:: len(quads) // 9 + 1]]
-    values = sampled(levels, warped(quads, unit), float(np.median(some))).astype(float)
-    values -= values.mean(axis=-1, keepdims=True)
-    return np.asarray(values / np.maximum(values.std(axis=-1, keepdims=True), 1e-3))
+    count = (PARTS[0] * CELLS, PARTS[1] * CELLS)
+    some = [_spacing(quad, count) for quad in quads[:: len(quads) // 9 + 1]]
+    level = _level(levels, float(np.median(some)))
+    unit = grid(count).astype(np.float32)
+    out = np.empty((len(quads), len(unit)), np.float32)
+    usable = np.nan_to_num(quads / 2**level, nan=-1e6).astype(np.float32)
+    for k in range(0, len(quads), CHUNK):  # small buffers that stay in the cache, however many poses there are
+        at = warped(usable[k : k + CHUNK], unit)
+        across, down = np.ascontiguousarray(at[..., 0]), np.ascontiguousarray(at[..., 1])
+        values = cv2.remap(levels[level], across, down, cv2.INTER_LINEAR)
+        values -= values.mean(axis=-1, keepdims=True)
+        spread = np.sqrt(np.einsum("pc,pc->p", values, values) / len(unit))
+        np.divide(values, np.maximum(spread, 1e-3)[:, None], out=out[k : k + CHUNK])
+    return out
 
 
-def part_distance(values: Array, reference: Array) -> Array:
+def part_distance(values: Grey, reference: Grey) -> Array:
     """Mean distance (P,) of the parts from a reference (cells,). Zhu 2012, eq. 13."""
-    return np.asarray(np.mean((values - reference) ** 2, axis=-1))
+    off = values - reference
+    return np.asarray(np.einsum("pc,pc->p", off, off) / off.shape[-1], dtype=float)
 
 
-def correlations(left: Array, right: Array) -> Array:
+def correlations(left: Grey, right: Grey) -> Array:
     """Normalised cross-correlation (P,) of what both views show. Zhu 2012, eqs. 17-18."""
-    return np.asarray(np.mean(left * right, axis=-1))
+    return np.asarray((left * right).mean(axis=-1), dtype=float)

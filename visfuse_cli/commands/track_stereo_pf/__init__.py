@@ -14,9 +14,10 @@ from visfuse_cli.commands.track_stereo_pf.scene import VIEWS, Scene, open_views,
 from visfuse_cli.errors import InputError
 from visfuse_cli.facing.annotate import UNITS, Drawn, together, together_size
 from visfuse_cli.facing.conclude import conclude
+from visfuse_cli.facing.front import Target
 from visfuse_cli.facing.output import track_record
+from visfuse_cli.facing.rival import follow_triangulated
 from visfuse_cli.facing.settings import StereoConfig
-from visfuse_cli.facing.target import Target
 from visfuse_cli.files.folders import paths_of
 from visfuse_cli.files.run_json import write_run_json
 from visfuse_cli.files.runfolder import RunFolder
@@ -91,7 +92,8 @@ def run(request: RunRequest) -> RunResult:
 
 def _settle(targets: list[Target], scene: Scene, spool: TrackSpool, results: _Results, run_: Run) -> None:
     for target in targets:
-        settled = conclude(target)
+        alone = target.config.filter.kind == "triangulation"
+        settled = follow_triangulated(target) if alone else conclude(target)
         if settled is None:
             results.dropped += 1
             run_.count("dropped")

@@ -9,10 +9,11 @@ import numpy as np
 
 from visfuse_cli.commands.track_stereo_pf.scene import VIEWS, Scene, pairs
 from visfuse_cli.errors import InputError
-from visfuse_cli.facing import target as front
+from visfuse_cli.facing import front, target
 from visfuse_cli.facing.find import Finder, Found
+from visfuse_cli.facing.front import Target
+from visfuse_cli.facing.look import settle_on
 from visfuse_cli.facing.settings import StereoConfig
-from visfuse_cli.facing.target import Target
 from visfuse_cli.files.video import VideoSource, open_source
 from visfuse_cli.maths.paths import Way
 from visfuse_cli.maths.planes import triangulated
@@ -68,8 +69,8 @@ def follow(
             first = False
         with run_.stage("filter"):
             for each in followed:
-                front.predict(each, pair.t)
-                front.update(each, views, at)
+                target.predict(each, pair.t)
+                target.update(each, views, at)
         ended = [each for each in followed if _over(each, scene, pair.t)]
         followed = [each for each in followed if each not in ended]
         with run_.stage("newcomers"):
@@ -101,7 +102,7 @@ def _settle_on_regions(
         if len(each.looks) > 1 and each.looks[-1].t == at[1]:
             region = finder.around(each.looks[-1].quads["left"])
             if region is not None:
-                front.settle_on(each, views, region, at[1] - each.looks[-2].t)
+                settle_on(each, views, region, at[1] - each.looks[-2].t)
 
 
 def _empty(scene: Scene, request: RunRequest, straight: Straight) -> Image:
@@ -178,9 +179,9 @@ def _begin_found(
     way = scene.way if config.filter.path_constraint else None
     if way is None:
         way = Way(np.stack([place, place + AHEAD_S * max(speed, 0.1) * velocity / speed]))
-        return front.start(identity, scene.rig, way, config, views, (left, right), speed, at, seed, False, False)
+        return target.start(identity, scene.rig, way, config, views, (left, right), speed, at, seed, False, False)
     along = float(way.frame(np.array(way.nearest(place)))[1][:, 0] @ velocity)
-    return front.start(identity, scene.rig, way, config, views, (left, right), along, at, seed, False, True)
+    return target.start(identity, scene.rig, way, config, views, (left, right), along, at, seed, False, True)
 
 
 def _begin(
@@ -203,7 +204,7 @@ def _begin(
         if not np.isfinite(place).all() or place[2] <= 0.1:
             return None
         way = Way(np.stack([place, place - [0, 0, AHEAD_M]]))
-    return front.start(identity, scene.rig, way, config, views, (left, right), speed, at, seed, given, on_path)
+    return target.start(identity, scene.rig, way, config, views, (left, right), speed, at, seed, given, on_path)
 
 
 def _over(target: Target, scene: Scene, t: float) -> bool:
