@@ -21,6 +21,7 @@ from visfuse_cli.commands.calibrate_homography import CalibrateConfig
 from visfuse_cli.errors import InputError, OutputError, UsageError
 from visfuse_cli.files import homography
 from visfuse_cli.files.calibration_input import read_points
+from visfuse_cli.files.stills import Stills
 from visfuse_cli.maths.layout import dashes, from_distances, rectangle
 from visfuse_cli.records import RunRequest
 from visfuse_cli.vision.corners import snap_line, snap_point
@@ -325,3 +326,19 @@ def test_a_defect_costs_nothing_that_was_picked(desk: Desk, monkeypatch: pytest.
         assert (status, json.loads(body)) == (500, {"reason": "internal error: oh"})
         assert ask(server, "GET", token + "about")[0] == 200
     assert "ZeroDivisionError" in capsys.readouterr().err
+
+
+def test_a_frame_is_found_by_its_time_in_clips_folders_and_pictures(tmp_path: Path):
+    clip = Stills(SAMPLE / "clip.mp4")
+    assert (clip.size, clip.duration) == ((960, 540), pytest.approx(9.96))
+    assert [clip.at(t)[0] for t in (0, 0.03, 1.0, 5.02, 1e6)] == pytest.approx([0, 0, 1.0, 5.0, 9.96])
+    times = [0.0, 0.5, 0.6, 2.0]
+    for k in range(4):
+        cv2.imwrite(str(tmp_path / f"{k}.png"), np.full((48, 64, 3), 10 * k, np.uint8))
+    (tmp_path / "timestamps.csv").write_text("frame,t\n" + "".join(f"{k},{t}\n" for k, t in enumerate(times)))
+    folder = Stills(tmp_path)
+    assert folder.duration == 2.0
+    for t, k in ((0, 0), (0.49, 0), (0.5, 1), (1.9, 2), (2.0, 3), (1e6, 3)):
+        when, image = folder.at(t)
+        assert (when, int(image[0, 0, 0])) == (times[k], 10 * k), t
+    assert Stills(tmp_path / "2.png").at(7.0)[0] == 0.0

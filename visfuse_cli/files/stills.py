@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from pathlib import Path
 
 import cv2
 import numpy as np
 
 from visfuse_cli.errors import InputError
-from visfuse_cli.files.clip import Clip
+from visfuse_cli.files.clip import RIGHT_THEN, Clip
 from visfuse_cli.files.folders import is_folder
-from visfuse_cli.files.video import open_source
+from visfuse_cli.files.images import ImageFolder
+from visfuse_cli.files.timing import TimeAuditor
 from visfuse_cli.records import Image
 
 
@@ -24,12 +26,16 @@ class Stills:
         self.path = path
         self._image = read_image_file(path)
         self._clip = None if self._image is not None or is_folder(path) else Clip(path, fps=1.0)
+        self._folder = ImageFolder(path, fps=1.0) if is_folder(path) else None
         if self._image is not None:
             self.size, self.interval, self.duration = (self._image.shape[1], self._image.shape[0]), 1.0, 0.0
             return
-        source = open_source(path, fps=1.0)
-        self.size, self.interval = (source.width, source.height), 1 / source.nominal_rate
-        self.duration = max((source.frame_count or 1) - 1, 0) * self.interval
+        reader = self._clip or self._folder
+        assert reader is not None
+        self.size, self.interval = (reader.width, reader.height), 1 / reader.nominal_rate
+        self.duration = max((reader.announced or 1) - 1, 0) * self.interval
+        if self._folder is not None:
+            self.duration = self._folder.stamps[-1]
 
     def at(self, t: float) -> tuple[float, Image]:
         """The frame that is shown at `t` (s), 8-bit BGR, and its own time; the last one after the end."""
@@ -38,9 +44,11 @@ class Stills:
         if self._clip is not None:
             when, picture = self._clip.still(t)
             return when, picture.bgr()
-        with open_source(self.path, fps=1.0, start=min(t, self.duration)) as source:
-            frame = next(iter(source.frames()))
-            return frame.t, frame.image
+        assert self._folder is not None
+        shown = max(bisect_right(self._folder.stamps, t + RIGHT_THEN) - 1, 0)
+        for _, when, image in self._folder.pictures(TimeAuditor(self.path.name), self._folder.stamps[shown]):
+            return when, image.bgr()
+        raise InputError(f"{self.path}: no image from {t:g} s on can be decoded")
 
 
 def read_image_file(path: Path) -> Image | None:
