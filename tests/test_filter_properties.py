@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 from tests.drives import stacked
 from tests.test_gaussian import covariance
 from visfuse_cli.maths import course, covariance_updating, fading, fusion, gaussian, imm, motion
+from visfuse_cli.maths.consistency import corrections
 from visfuse_cli.maths.smoothing import rauch_tung_striebel
 from visfuse_cli.records import Gaussian
 
@@ -99,3 +100,14 @@ def test_mixing_a_short_state_into_a_long_one_leaves_what_they_share(seed):
     np.testing.assert_allclose(mixed.mean[:, :4], np.stack([shared, shared]), atol=1e-12)
     np.testing.assert_allclose(np.exp(ahead).sum(), 1, atol=1e-12)
     assert np.linalg.eigvalsh(mixed.cov).min() > 0
+
+
+@settings(max_examples=25, deadline=None)
+@given(SEEDS)
+def test_corrections_are_as_large_as_the_innovations(seed):
+    rng = np.random.default_rng(seed)
+    prior = Gaussian(rng.normal(size=(3, 6)), covariance(rng, 3, 6))
+    after, innovation = gaussian.update(prior, rng.normal(size=(3, 3)), np.eye(3, 6), covariance(rng, 3))
+    unseen = Gaussian(np.concatenate([after.mean, prior.mean]), np.concatenate([after.cov, prior.cov]))
+    twice = Gaussian(np.tile(prior.mean, (2, 1)), np.tile(prior.cov, (2, 1, 1)))
+    np.testing.assert_allclose(corrections(twice, unseen, 3), innovation.nis, rtol=1e-5)

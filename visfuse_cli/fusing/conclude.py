@@ -14,6 +14,7 @@ from visfuse_cli.fusing.person import ASSUMED, BOX, DT, LEVER, VARIANCE, Person,
 from visfuse_cli.fusing.settings import FuseConfig
 from visfuse_cli.fusing.tracker import at_rest, held_motion
 from visfuse_cli.maths import fusion, fusion_rivals, gaussian
+from visfuse_cli.maths.consistency import corrections
 from visfuse_cli.maths.fusion_rivals import Bank
 from visfuse_cli.maths.gaussian import times
 from visfuse_cli.maths.multiview import project
@@ -47,6 +48,7 @@ class Path:
     height: float
     noise: float  # the measurement noise that was found, as a share of the nominal one (variance)
     sigma_a: float
+    nis: Array  # normalised corrections of the position, of each instant that more than one camera saw
     refused: int
     ended_by: str
 
@@ -71,13 +73,13 @@ def conclude(person: Person, P: Array, config: FuseConfig) -> Path | None:
     state = person.history.state
     sights, lever = _sights(rows, seen, state, P, person.body.ends.mean)
     noise, sigma_a = 1.0, config.filter.sigma_a
-    belief = _filtered(person, sights, P, t, state, config, noise, sigma_a)
+    belief, nis = _filtered(person, sights, P, t, state, config, noise, sigma_a)
     pixels, J = project(P[sights.camera], belief.mean[sights.owner, :3])
     if config.filter.adapt and config.smooth:
         noise, once = disagreement(sights, sights.z - pixels, t)
         places = _places(sights, pixels, J, belief, once)
         sigma_a = restlessness(*places, t, config.filter, person.start)
-        belief = _filtered(person, sights, P, t, state, config, noise, sigma_a)
+        belief, nis = _filtered(person, sights, P, t, state, config, noise, sigma_a)
         pixels, J = project(P[sights.camera], belief.mean[sights.owner, :3])
     cov = belief.cov.copy()
     cov[:, :3, :3] += BODY_SIGMA**2 * noise * np.eye(3) + _by_body(sights, J, lever, person.body.ends.cov, len(t))
@@ -98,6 +100,7 @@ def conclude(person: Person, P: Array, config: FuseConfig) -> Path | None:
         height=person.body.ends.height,
         noise=noise,
         sigma_a=sigma_a,
+        nis=nis,
         refused=person.refused,
         ended_by=person.ended_by,
     )
@@ -140,8 +143,8 @@ def _filtered(
     config: FuseConfig,
     noise: float,
     sigma_a: float,
-) -> Gaussian:
-    """Beliefs (T, 6) with the measurement noise scaled, smoothed where that is asked for."""
+) -> tuple[Gaussian, Array]:
+    """Beliefs (T, 6) with the measurement noise scaled, smoothed where asked for; normalised corrections (k,)."""
     scaled = Sights(sights.owner, sights.camera, sights.z, sights.R * noise, sights.dt)
     start = Gaussian(person.start.mean, person.start.cov * START_DOUBT**2)
     belief = at_rest(start, sigma_a, config.filter)
@@ -172,7 +175,7 @@ def _filtered(
         for beliefs in (posterior, prior)
     )
     settled = rauch_tung_striebel(filtered, predicted, np.stack(transitions)) if config.smooth else filtered
-    return Gaussian(settled.mean[:, :6], settled.cov[:, :6, :6])
+    return Gaussian(settled.mean[:, :6], settled.cov[:, :6, :6]), corrections(predicted, filtered, 3)
 
 
 def _pairwise_step(sights: Sights, P: Array, near: Array) -> Callable[[int, Gaussian], Gaussian]:

@@ -66,6 +66,8 @@ def _summary(path: Path, names: list[str]) -> dict[str, Any]:
         "height": path.height,
         "reprojection_px": None if error is None else float(error),
         "cameras": {name: int(np.count_nonzero(path.seen[:, c])) for c, name in enumerate(names)},
+        "nis_mean": float(path.nis.mean()) if len(path.nis) else None,
+        "nis_dof": 3,
         "noise": path.noise,
         "sigma_a": path.sigma_a,
         "ended": path.ended_by,

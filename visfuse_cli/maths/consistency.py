@@ -8,7 +8,11 @@ from typing import Any
 import numpy as np
 from scipy.stats import chi2
 
+from visfuse_cli.maths.gaussian import mahalanobis, symmetrise
+from visfuse_cli.records import Array, Gaussian
+
 BAND = 0.999  # probability inside the bands
+FULL_RANK = 1e-6  # share of the largest eigenvalue, above rounding
 
 
 def verdict(ratio: float, freedom: float) -> dict[str, Any]:
@@ -26,6 +30,19 @@ def innovations(summaries: Iterable[Mapping[str, Any]]) -> dict[str, Any] | None
         return None
     ratio, freedom = table.T
     return verdict(float(ratio @ freedom / freedom.sum()), float(freedom.sum()))
+
+
+def corrections(prior: Gaussian, posterior: Gaussian, size: int) -> Array:
+    """Normalised squares (k,), chi-square of `size`, of what measurements moved the first numbers of beliefs (T, n).
+
+    A Kalman filter's correction K g has the covariance K S K^T: the prior's less the posterior's. Instants whose
+    measurement did not tell all `size` numbers are left out.
+    """
+    moved = (posterior.mean - prior.mean)[:, :size]
+    spread = symmetrise(prior.cov - posterior.cov)[:, :size, :size]
+    values = np.linalg.eigvalsh(spread)
+    whole = values[:, 0] > FULL_RANK * np.maximum(values[:, -1], np.finfo(float).tiny)
+    return mahalanobis(moved[whole], spread[whole])
 
 
 def _told(summary: Mapping[str, Any]) -> tuple[float, float] | None:
