@@ -53,8 +53,11 @@ def held_acceleration(dt: float, hold: float) -> tuple[Array, Array]:
     """F (3, 3), and Q (3, 3) at unit density, of one axis over dt s whose acceleration is forgotten within `hold` s.
 
     Singer's model: seen over longer than `hold` the acceleration is white, with the density that multiplies Q
-    (m^2 s^-3). By Van Loan's matrix exponential.
+    (m^2 s^-3). By Van Loan's matrix exponential, over steps that are short beside `hold`, doubled.
     """
+    if dt > hold:
+        half, own = held_acceleration(dt / 2, hold)
+        return half @ half, np.asarray(symmetrise(half @ own @ half.T + own))
     rate = np.array([[0.0, 1, 0], [0, 0, 1], [0, 0, -1 / hold]])
     drive = np.diag([0.0, 0, 1 / hold**2])
     both = expm(np.block([[-rate, drive], [np.zeros((3, 3)), rate.T]]) * dt)
