@@ -27,7 +27,7 @@ def dark(P: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 
 def test_a_grey_person_is_no_shadow_and_a_shadow_is():
-    P = ring()
+    P = ring(high=6.0)  # from there all see the ground behind the person
     x, y = np.meshgrid(np.arange(-3, 3.1, 0.5), np.arange(-3, 3.1, 0.5))
     shadows = GroundShadows(P, SIZES, np.column_stack([x.ravel(), y.ravel()]))
     angle, up = np.meshgrid(np.linspace(0, 2 * np.pi, 24), np.arange(0.02, 1.75, 0.04))
