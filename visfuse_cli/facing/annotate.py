@@ -15,14 +15,19 @@ from visfuse_cli.vision import drawing
 UNITS = {"km/h": 3.6, "mph": 2.2369362920544, "m/s": 1.0}
 WIDEST = 1920  # px of both views together
 TRAIL = 60  # states
+PATH, PARTICLE = (200, 200, 200), (60, 220, 255)
+FAR_OFF = 1e4  # px
 
 
 class Drawn:
     """One settled track of tracks.json, ready to be drawn."""
 
-    def __init__(self, record: dict[str, Any], rig: StereoRig, units: str) -> None:
+    def __init__(
+        self, record: dict[str, Any], rig: StereoRig, units: str, clouds: dict[int, Array], way: Array
+    ) -> None:
         self.id = int(record["id"])
         self._rig, self._units = rig, units
+        self._clouds, self._way = clouds, way
         self._states = {int(state["frame"]): state for state in record["states"]}
         self._places = np.array([state["position"] for state in record["states"]])
         self._frames = np.array([state["frame"] for state in record["states"]])
@@ -36,7 +41,10 @@ class Drawn:
             return
         upto = int(np.searchsorted(self._frames, frame, side="right"))
         for view, image in pictures.items():
-            drawing.polyline(image, self._trail(view, self._places[:upto][-TRAIL:]), self.colour)
+            drawing.polyline(image, self._seen(view, self._way), PATH, width=1)
+            for dot in self._seen(view, self._clouds.get(frame, np.zeros((0, 3)))):
+                cv2.circle(image, (round(dot[0]), round(dot[1])), 1, PARTICLE, -1, cv2.LINE_AA)
+            drawing.polyline(image, self._seen(view, self._places[:upto][-TRAIL:]), self.colour)
             quad = state["quad"].get(view)
             if quad is not None:
                 drawing.polyline(image, np.array(quad), self.colour, closed=True)
@@ -44,12 +52,11 @@ class Drawn:
                 text = f"{self.id}  {speed:.1f} {self._units} (mean {mean:.1f})"
                 drawing.label(image, text, np.array(quad).min(axis=0) - [0, 4], self.colour)
 
-    def _trail(self, view: str, places: Array) -> Array:
-        if view == "left":
-            pixels, lens = projected(self._rig.left.K, places), self._rig.left
-        else:
-            pixels, lens = projected(self._rig.right.K, in_right(self._rig, places)), self._rig.right
-        return shown(pixels, lens)
+    def _seen(self, view: str, places: Array) -> Array:
+        """Pixels (n, 2) of those places (n, 3) m that lie before the camera."""
+        lens = self._rig.left if view == "left" else self._rig.right
+        pixels = projected(lens.K, places if view == "left" else in_right(self._rig, places))
+        return shown(pixels[np.isfinite(pixels).all(axis=1) & (np.abs(pixels) < FAR_OFF).all(axis=1)], lens)
 
 
 def together_size(width: int, height: int) -> tuple[int, int]:

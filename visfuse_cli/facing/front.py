@@ -97,6 +97,7 @@ class Target:
     pieces: Pieces = field(default_factory=Pieces)
     looks: list[Looked] = field(default_factory=list)
     causal: list[tuple[int, float, Gaussian, bool]] = field(default_factory=list)
+    clouds: dict[int, Array] = field(default_factory=dict)  # by frame: where some of the particles stood (n, 3) m
     ended_by: str = ""
 
     @property

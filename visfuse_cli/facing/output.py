@@ -16,11 +16,12 @@ def shown(quad: Array, lens: Lens) -> Array:
     return distort_points(quad, lens) if np.any(lens.D) else quad
 
 
-def track_record(path: Settled, rig: StereoRig) -> dict[str, Any]:
+def track_record(path: Settled, rig: StereoRig, latency: float) -> dict[str, Any]:
     """One track of tracks.json."""
     mean, cov = path.belief.mean, path.belief.cov
     lenses = {"left": rig.left, "right": rig.right}
     low = max(0.0, path.mean_speed - Z95 * path.mean_sigma)
+    ahead = mean[:, :3] + latency * mean[:, 3:]
     return {
         "id": path.id,
         "summary": {
@@ -49,6 +50,7 @@ def track_record(path: Settled, rig: StereoRig) -> dict[str, Any]:
                 "quad": {view: shown(quad, lenses[view]).tolist() for view, quad in path.quads[k].items()},
                 "measured": bool(path.measured[k]),
             }
+            | ({"ahead": {"t": float(path.t[k] + latency), "position": ahead[k].tolist()}} if latency else {})
             for k in range(len(path.t))
         ],
     }

@@ -84,3 +84,4 @@ class StereoConfig(Section):
     life: LifeSettings = LifeSettings()
     display: DisplaySettings = DisplaySettings()
     smooth: bool = Field(True, description="true: a backward pass over each whole track; false: the causal filter")
+    latency: float = Field(0.0, ge=0, le=10, description="s: every state is also predicted this far ahead")

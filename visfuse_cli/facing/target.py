@@ -35,6 +35,7 @@ SIGN_FRAMES = 2  # frames after which the direction of travel is decided
 FOUND_SHARE = 0.4  # how far the speed of what was found unaided may be off
 STRAYED = 60.0  # squared deviations of the best particle from the patch that was found
 TEMPER = 4.0
+SHOWN = 60  # particles that are drawn
 BLUR_PX, BLUR_STRETCH = 0.3, 0.01
 
 
@@ -153,6 +154,8 @@ def update(target: Target, views: dict[str, list[Grey]], at: tuple[int, float]) 
             target.sought = patches.template(views["left"], target.looks[-1].quads["left"])
     belief = particles.moments(target.states, target.log_weights)
     target.causal.append((*at, belief, seen))
+    shown = target.states[:: max(1, len(target.states) // SHOWN)]
+    target.clouds[at[0]] = corners(target, shown).mean(axis=1)
     if particles.effective_number(target.log_weights) < AGAIN * len(target.states):
         _draw(target, target.log_weights)
 

@@ -9,6 +9,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from visfuse_cli.commands.track_stereo_pf.follow import follow
 from visfuse_cli.commands.track_stereo_pf.scene import VIEWS, Scene, open_views, pairs, read
 from visfuse_cli.errors import InputError
@@ -25,7 +27,9 @@ from visfuse_cli.files.spool import TrackSpool
 from visfuse_cli.files.video import describe
 from visfuse_cli.files.video_writer import VideoWriter
 from visfuse_cli.pipeline import Run
-from visfuse_cli.records import RunRequest, RunResult
+from visfuse_cli.records import Array, RunRequest, RunResult
+
+WAY_POINTS = 40  # that a path is drawn with
 
 __all__ = ["StereoConfig", "run", "text"]
 
@@ -35,6 +39,8 @@ class _Results:
     begun: list[tuple[int, int]] = field(default_factory=list)  # first frame, id
     speeds: list[dict[str, Any]] = field(default_factory=list)
     dropped: int = 0
+    clouds: dict[int, dict[int, Array]] = field(default_factory=dict)  # by id and frame, for the video
+    ways: dict[int, Array] = field(default_factory=dict)
 
 
 def run(request: RunRequest) -> RunResult:
@@ -98,7 +104,10 @@ def _settle(targets: list[Target], scene: Scene, spool: TrackSpool, results: _Re
             results.dropped += 1
             run_.count("dropped")
             continue
-        record = track_record(settled, scene.rig)
+        record = track_record(settled, scene.rig, target.config.latency)
+        results.clouds[settled.id] = target.clouds
+        ends = [settled.way.nearest(place) for place in settled.belief.mean[[0, -1], :3]]
+        results.ways[settled.id] = settled.way.frame(np.linspace(ends[0], ends[1], WAY_POINTS))[0]
         spool.add(record)
         results.begun.append((settled.frame[0], settled.id))
         results.speeds.append(
@@ -111,7 +120,8 @@ def _annotate(scene: Scene, folder: Path, request: RunRequest, run_: Run, spool:
     """Write both views side by side, from a second decode."""
     sources = open_views(scene, request)
     drawn = [
-        Drawn(spool.read(identity), scene.rig, request.config.display.units) for _, identity in sorted(results.begun)
+        Drawn(spool.read(k), scene.rig, request.config.display.units, results.clouds[k], results.ways[k])
+        for _, k in sorted(results.begun)
     ]
     size = together_size(*scene.size)
     with (

@@ -1,0 +1,152 @@
+"""`track-stereo-pf` on rendered passes: `python benchmarks/stereo.py [straight noise unaided curved rivals ...]`.
+
+`--seeds N` passes each (20). Errors are of the summary speed, in miles an hour; `particles` is Zhu 2012's tables I and
+II with the causal filter, as the paper has it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+from samples.passing import MPH, straight_pass, write_pass
+from visfuse_cli.commands.track_stereo_pf import run
+from visfuse_cli.facing.settings import StereoConfig
+from visfuse_cli.records import RunRequest
+from visfuse_cli.vision import patches
+
+UNAIDED = {"init": False, "path": False}
+
+
+def main() -> None:
+    tables: dict[str, Callable[[int], None]] = {
+        "straight": lambda n: passes("straight passes", n),
+        "noise": noises,
+        "unaided": lambda n: passes("nothing named", n, **UNAIDED),
+        "curved": lambda n: passes("curved passes, 36 mph", n, radius=52.0, mph=36.0),
+        "rivals": rivals,
+        "particles": particles,
+        "speed": lambda n: speed(),
+    }
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("tables", nargs="*", metavar="table", help=f"of {', '.join(tables)}; all without one")
+    parser.add_argument("--seeds", type=int, default=20)
+    args = parser.parse_args()
+    unknown = sorted(set(args.tables) - set(tables))
+    if unknown:
+        parser.error(f"no table {unknown[0]}; there are {', '.join(tables)}")
+    for name in args.tables or tables:
+        tables[name](args.seeds)
+
+
+def noises(seeds: int) -> None:
+    """Three levels of image noise."""
+    for level in (1.0, 2.0, 4.0):
+        passes(f"image noise {level:g}", seeds, noise=level)
+
+
+def passes(title: str, seeds: int, settings: dict | None = None, **scene) -> None:
+    """One line: errors (mph), intervals that hold the truth, runs without a frame after the third off by 1 mph."""
+    files = {key: scene.pop(key) for key in ("init", "path") if key in scene}
+    errors, held, steady = [], 0, 0
+    for seed in range(seeds):
+        with tempfile.TemporaryDirectory() as folder:
+            made = straight_pass(seed, **scene)
+            write_pass(made, Path(folder) / "scene", **files)
+            track = longest(Path(folder), settings or {}, seed)
+        if track is None:
+            continue
+        truth = made.passes[0].speed
+        low, high = track["summary"]["speed_ci95"]
+        errors.append((track["summary"]["speed"] - truth) / MPH)
+        held += low <= truth <= high
+        steady += all(abs(state["speed"] - truth) < MPH for state in track["states"][3:])
+    off = np.abs(errors)
+    print(
+        f"{title:<34} {len(errors)} of {seeds} found, mean error {off.mean():.3f}, worst {off.max():.3f}, "
+        f"{np.count_nonzero(off < 0.33)} below 0.33, {held} intervals hold, {steady} steady",
+        flush=True,
+    )
+
+
+def longest(folder: Path, settings: dict, seed: int) -> dict | None:
+    """The longest track of a run on folder/scene."""
+    config = StereoConfig.model_validate(settings)
+    out = folder / "run"
+    request = RunRequest("track-stereo-pf", folder / "scene", out, config, video=False, report=False, seed=seed)
+    run(RunRequest(**{name: getattr(request, name) for name in request.__slots__} | {"progress": False}))
+    tracks = json.loads((out / "tracks.json").read_text(encoding="utf-8"))["tracks"]
+    return max(tracks, key=lambda track: len(track["states"]), default=None)
+
+
+def rivals(seeds: int) -> None:
+    """The backward pass beside the causal filter, the unconstrained filter, and triangulation with a Kalman filter."""
+    causal = {"smooth": False}
+    passes("backward pass", seeds)
+    passes("causal, along the path", seeds, causal)
+    passes("causal, six degrees of freedom", seeds, causal | {"filter": {"path_constraint": False}})
+    passes("causal, triangulated and Kalman", seeds, causal | {"filter": {"kind": "triangulation"}})
+    passes("smoothed, triangulated and Kalman", seeds, {"filter": {"kind": "triangulation"}})
+
+
+def particles(seeds: int) -> None:
+    """Numbers of particles and noises of the speed, 55 mph. Paper: 200 particles, worst error 0.33 mph."""
+    for count in (100, 200, 400, 600, 800):
+        settings = {"smooth": False, "filter": {"particles": count, "sigma_v": 0.05}}
+        passes(f"{count} particles, noise 0.05", seeds, settings, mph=55.0)
+    for noise in (0.05, 0.10, 0.15, 0.20, 0.25):
+        settings = {"smooth": False, "filter": {"particles": 400, "sigma_v": noise}}
+        passes(f"400 particles, noise {noise:.2f}", seeds, settings, mph=55.0)
+
+
+def speed() -> None:
+    """CPU time of the observation of 400 particles in both 1280x960 views, ours and a loop that warps each."""
+    cv2.setNumThreads(1)
+    rng = np.random.default_rng(0)
+    views = [cv2.GaussianBlur(rng.integers(0, 255, (960, 1280, 3), np.uint8), (0, 0), 2) for _ in range(2)]
+    levels = [patches.pyramid(view) for view in views]
+    quads = np.array([[500, 400], [620, 400], [620, 490], [500, 490]]) + rng.normal(0, 1.5, (400, 1, 2))
+    reference = patches.part_values(levels[0], quads[:1])[0]
+
+    def ours() -> None:
+        values = [patches.part_values(each, quads) for each in levels]
+        for each in values:
+            patches.part_distance(each, reference)
+        patches.correlations(*values)
+
+    def loop() -> None:
+        square = np.array([[0, 0], [40, 0], [40, 40], [0, 40]], np.float32)
+        for quad in quads.astype(np.float32):
+            warped = [
+                cv2.warpPerspective(each[0], cv2.getPerspectiveTransform(quad, square), (40, 40)) for each in levels
+            ]
+            for picture in warped:
+                parts = picture.reshape(2, 20, 5, 8).swapaxes(1, 2).reshape(10, 20, 8)
+                np.concatenate([cv2.resize(part, (4, 4), interpolation=cv2.INTER_AREA).ravel() for part in parts])
+            np.corrcoef(warped[0].ravel(), warped[1].ravel())
+
+    pairs = [(cpu(ours), cpu(loop)) for _ in range(7)]
+    ratio = float(np.median([slow / quick for quick, slow in pairs]))
+    print(
+        f"observation of 400 particles {1e3 * np.median([a for a, _ in pairs]):.1f} ms; the loop takes {ratio:.1f} times"
+    )
+
+
+def cpu(work: Callable[[], None]) -> float:
+    begun = time.process_time()
+    work()
+    return time.process_time() - begun
+
+
+if __name__ == "__main__":
+    main()
