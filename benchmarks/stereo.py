@@ -138,7 +138,8 @@ def speed() -> None:
     pairs = [(cpu(ours), cpu(loop)) for _ in range(7)]
     ratio = float(np.median([slow / quick for quick, slow in pairs]))
     print(
-        f"observation of 400 particles {1e3 * np.median([a for a, _ in pairs]):.1f} ms; the loop takes {ratio:.1f} times"
+        f"observation of 400 particles {1e3 * np.median([a for a, _ in pairs]):.1f} ms; "
+        f"the loop takes {ratio:.1f} times as long"
     )
 
 
