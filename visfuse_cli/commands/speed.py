@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field, replace
-from datetime import UTC, datetime, timedelta
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -27,24 +27,22 @@ from visfuse_cli.files.spool import TrackSpool, write_table
 from visfuse_cli.files.video import VideoSource, describe, is_clip_folder, list_clips, open_source
 from visfuse_cli.files.video_writer import VideoWriter
 from visfuse_cli.files.wall_clock import began, check_pattern, known_zone
-from visfuse_cli.maths.cameras import ground_camera, project, raised
+from visfuse_cli.maths.cameras import ground_camera, raised
 from visfuse_cli.maths.polygons import Polygon
 from visfuse_cli.pipeline import Run
 from visfuse_cli.records import Array, GroundCamera, GroundMap, Image, RunRequest, RunResult, TimeAudit
 from visfuse_cli.tracking.annotate import annotate
 from visfuse_cli.tracking.camera_watch import CameraWatch
-from visfuse_cli.tracking.conclude import conclude
 from visfuse_cli.tracking.foreground import Detections, Detector, MovingRegions
 from visfuse_cli.tracking.ground import GroundTracker
-from visfuse_cli.tracking.headlights import REASON, Headlights
-from visfuse_cli.tracking.lanes import Way, find_lanes, lane_of, thinned
+from visfuse_cli.tracking.headlights import Headlights
+from visfuse_cli.tracking.ledger import Ledger, Recording, utc
 from visfuse_cli.tracking.options import SpeedOptions
-from visfuse_cli.tracking.output import COLUMNS, abandoned_row, row_of, track_record
+from visfuse_cli.tracking.output import COLUMNS
 from visfuse_cli.tracking.privacy import Strangers
 from visfuse_cli.tracking.summary import summarised, text
 from visfuse_cli.tracking.targets import Abandoned, Track
-from visfuse_cli.tracking.verdict import judge
-from visfuse_cli.tracking.zones import Region, trusted
+from visfuse_cli.tracking.zones import Region
 from visfuse_cli.vision.empty import empty_picture
 from visfuse_cli.vision.steady import at_rest
 
@@ -52,7 +50,6 @@ __all__ = ["SpeedConfig", "run", "text"]
 
 WARMUP_PICTURES = 31
 LEAST_SIDE = 8  # px
-SEEN_FRAMES = 8  # a region seen for fewer frames than this is noise and not worth a line in the ledger
 
 
 class VideoSettings(Section):
@@ -92,13 +89,9 @@ class SpeedConfig(SpeedOptions):
 
 @dataclass(slots=True)
 class _Results:
-    """What a run has found so far: table rows (small) and where each clip's tracks begin."""
+    """What a run has found so far, by clip where it is a clip's own."""
 
-    rows: list[dict[str, Any]] = field(default_factory=list)
-    rejected: list[dict[str, Any]] = field(default_factory=list)
-    speeds: list[float] = field(default_factory=list)  # m/s
-    ways: dict[int, Way] = field(default_factory=dict)  # track -> where it drove while it was measured
-    drawn: dict[str, list[tuple[int, int]]] = field(default_factory=dict)  # clip -> (first frame, id)
+    ledger: Ledger
     audits: dict[str, TimeAudit] = field(default_factory=dict)
     began: dict[str, datetime | None] = field(default_factory=dict)
     doubts: list[str] = field(default_factory=list)  # about times of day
@@ -128,7 +121,7 @@ def run(request: RunRequest) -> RunResult:
     known = config.lanes or (read_lanes(config.lanes_file) if config.lanes_file is not None else None)
     given = (request.options["homography"], request.options.get("detections"), known and config.lanes_file)
     inputs = [describe(path) for path in (*clips, *given) if path]
-    results = _Results()
+    results = _Results(Ledger(config))
     for path in clips:
         with _open(path, request) as source:
             _check_size(source, ground, path)
@@ -151,19 +144,22 @@ def run(request: RunRequest) -> RunResult:
                 next_id = _track(clip, run_, spool, results, next_id, path.name if several else None)
             if run_.stopped_by is not None:
                 break
-        lanes = known or _found_lanes(results, camera, config, run_)
-        _settle_lanes(results, lanes, folder, None if known else config.lanes_file)
-        write_table(folder / "speeds.csv", COLUMNS, results.rows)
-        write_table(folder / "rejected.csv", (*COLUMNS, "reason"), results.rejected)
+        ledger = results.ledger
+        lanes = known or _found_lanes(ledger, camera, config, run_)
+        ledger.give_lanes(lanes)
+        if lanes:
+            write_lanes(folder / "lanes.yaml", lanes)
+        write_table(folder / "speeds.csv", COLUMNS, ledger.rows)
+        write_table(folder / "rejected.csv", (*COLUMNS, "reason"), ledger.rejected)
         if request.video and run_.stopped_by is None:
             for path in clips:
-                if path.name in results.drawn:
+                if path.name in ledger.drawn:
                     name = f"annotated-{path.stem}.mp4" if several else "annotated.mp4"
                     _annotate(path, folder / name, ground, request, run_, spool, results, lanes)
         if not config.privacy.blur:  # the picture shows a frame of the footage
             _keep_calibration_picture(request.options["homography"], folder)
         summary = summarised(
-            results.speeds, len(results.rejected), config.display.units, run_.counts["frames"], results.audits, folder
+            ledger.speeds, len(ledger.rejected), config.display.units, run_.counts["frames"], results.audits, folder
         )
         write_run_json(
             folder / "run.json",
@@ -180,7 +176,7 @@ def run(request: RunRequest) -> RunResult:
             stopped_by=run_.stopped_by,
             extra={
                 "summary": summary,
-                "began_utc": {name: _utc(moment, 0.0) or None for name, moment in results.began.items()},
+                "began_utc": {name: utc(moment, 0.0) or None for name, moment in results.began.items()},
                 "camera": {name: watch.report() for name, watch in results.watches.items()},
                 "crs": None if ground.reference is None else asdict(ground.reference),
                 "sun": results.suns,
@@ -236,12 +232,13 @@ def _check_size(source: VideoSource, ground: GroundMap, path: Path) -> None:
 def _track(clip: _Clip, run_: Run, spool: TrackSpool, results: _Results, first_id: int, label: str | None) -> int:
     """Follow everything in one clip; returns the next free id."""
     tracker = GroundTracker(clip.camera, clip.config, first_id)
-    results.drawn[clip.name] = []
+    results.ledger.drawn[clip.name] = []
     strangers = results.strangers[clip.name] = Strangers(clip.camera)
     with run_.stage("warm up"):
         empty = empty_picture(at_rest(_sampled(clip.source, clip.config.background.warmup_s)))
         watch = results.watches[clip.name] = CameraWatch(empty)
         look, lamps = _detector(clip, empty), Headlights(empty, clip.camera)
+    of = Recording(clip.name, label, clip.camera, results.began[clip.name], watch.image_from_rest)
     for shown in run_.frames(clip.source):
         run_.count("frames")
         with run_.stage("steady"):
@@ -257,10 +254,10 @@ def _track(clip: _Clip, run_: Run, spool: TrackSpool, results: _Results, first_i
                 strangers.add(frame.index, tracker.unexplained)
             lamps.look(frame, tracker.tracks, tracker.headings())
         with run_.stage("conclude"):
-            _settle(*ended, clip, tracker, lamps, run_, spool, results, label)
+            _settle(*ended, of, tracker, lamps, run_, spool, results.ledger)
         with run_.stage("learn"):
             look.learn(frame, tracker)
-    _settle(*tracker.finish(), clip, tracker, lamps, run_, spool, results, label)
+    _settle(*tracker.finish(), of, tracker, lamps, run_, spool, results.ledger)
     results.suns[clip.name] = look.report()
     audit = results.audits[clip.name] = clip.source.audit()
     for warning in (*audit.warnings, *watch.warnings(clip.name)):
@@ -294,77 +291,32 @@ def _sampled(source: VideoSource, warmup_s: float) -> Iterator[Any]:
 def _settle(
     tracks: list[Track],
     abandoned: list[Abandoned],
-    clip: _Clip,
+    of: Recording,
     tracker: GroundTracker,
     lamps: Headlights,
     run_: Run,
     spool: TrackSpool,
-    results: _Results,
-    label: str | None,
+    ledger: Ledger,
 ) -> None:
     """Turn what ended into records and table rows."""
-    config, begun = clip.config, results.began[clip.name]
-    region = Region(np.array(config.region)) if config.region else None
-    watch = results.watches[clip.name]
     for track in tracks:
-        whole = conclude(track, clip.camera, config, tracker.dynamics)
-        path = whole if region is None else region.part(whole)
-        if path is None:
-            continue
-        position = path.planar.mean[:, :2]
-        zone = trusted(clip.camera, position, config.pose.bias_px, config.speed.max_calibration)
-        verdict = judge(path, clip.camera.ground.cov, config.pose.bias_px, config.speed, zone)
-        if lamps.only_light(path.id):
-            verdict = replace(verdict, reason=REASON)
-        spool.add(track_record(path, verdict, clip.camera, label, watch.image_from_rest, config.latency))
-        results.drawn[clip.name].append((int(path.frame[0]), path.id))
-        results.ways[path.id] = thinned(position[verdict.first : verdict.last + 1])
-        row = row_of(path, verdict, clip.name, _utc(begun, path.t[verdict.first]))
-        if verdict.reason:
-            results.rejected.append(row)
-            run_.count("rejected")
-        else:
-            results.rows.append(row)
-            results.speeds.append(verdict.speed)
-            run_.count("vehicles")
+        record = ledger.take(track, of, tracker.dynamics, lamps.only_light(track.id))
+        if record is not None:
+            spool.add(record)
+            run_.count("rejected" if record["summary"]["rejected"] else "vehicles")
     for candidate in abandoned:
-        place = candidate.position
-        inside = place is not None and (region is None or bool(region.holds(np.array(place))))
-        if inside and candidate.n_frames >= SEEN_FRAMES:
-            results.rejected.append(abandoned_row(candidate, clip.name, _utc(begun, candidate.t_start)))
+        ledger.give_up(candidate, of)
         run_.count("regions that never became a track")
 
 
-def _found_lanes(results: _Results, camera: GroundCamera, config: SpeedConfig, run_: Run) -> tuple[Polygon, ...]:
-    """Lanes from where the vehicles of all clips drove, if that is asked for and there were enough of them."""
-    if not config.lane_finding.find or config.target.motion != "bicycle":
-        return ()
-
-    def image_of(ground: Array) -> Array:
-        return project(camera, np.column_stack([ground, np.zeros(len(ground))]))[0]
-
-    lanes = find_lanes([results.ways[row["track_id"]] for row in results.rows], config.lane_finding, image_of)
-    if config.lanes_file is not None and not lanes:
-        run_.warn(f"{config.lanes_file}: not written: {len(results.rows)} vehicles tell of no lane")
+def _found_lanes(ledger: Ledger, camera: GroundCamera, config: SpeedConfig, run_: Run) -> tuple[Polygon, ...]:
+    """The lanes that this run finds, kept in the file that is still missing."""
+    lanes = ledger.found_lanes(camera)
+    if config.lanes_file is not None and lanes:
+        write_lanes(config.lanes_file, lanes)
+    elif config.lanes_file is not None:
+        run_.warn(f"{config.lanes_file}: not written: {len(ledger.rows)} vehicles tell of no lane")
     return lanes
-
-
-def _settle_lanes(results: _Results, lanes: tuple[Polygon, ...], folder: Path, missing: Path | None) -> None:
-    """Tell each vehicle its lane, and keep the lanes that were used; also where they are `missing` so far."""
-    for row in (*results.rows, *results.rejected):
-        if row["track_id"] in results.ways:
-            row["lane"] = lane_of(results.ways[row["track_id"]], lanes)
-    if lanes:
-        write_lanes(folder / "lanes.yaml", lanes)
-        if missing is not None:
-            write_lanes(missing, lanes)
-
-
-def _utc(begun: datetime | None, t: float) -> str:
-    if begun is None:
-        return ""
-    moment = (begun + timedelta(seconds=float(t))).astimezone(UTC)
-    return moment.isoformat(timespec="milliseconds").replace("+00:00", "Z")
 
 
 def _annotate(
@@ -382,7 +334,7 @@ def _annotate(
     places = {f"lane {number}": lane for number, lane in enumerate(lanes, start=1)} | {"region": config.region}
     with _open(path, request) as source:
         camera = _camera(ground, source, request.config)
-        records = (spool.read(identity) for _, identity in sorted(results.drawn[path.name]))
+        records = (spool.read(identity) for _, identity in sorted(results.ledger.drawn[path.name]))
         watch, strangers = results.watches[path.name], results.strangers[path.name]
         with (
             VideoWriter(out, source.width, source.height, source.nominal_rate) as video,

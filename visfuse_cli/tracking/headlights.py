@@ -10,19 +10,20 @@ from scipy.ndimage import map_coordinates
 
 from visfuse_cli.records import Array, Frame, GroundCamera, Image
 from visfuse_cli.tracking.targets import Track
+from visfuse_cli.vision.empty import NIGHT
 from visfuse_cli.vision.lens import distort_points
 from visfuse_cli.vision.wireframe import silhouette
 
-NIGHT = 45  # grey levels: half of a scene at night is darker
 EVERY = 3  # frames: looked at no more often
 BRIGHTER, DARKER = 15, 5  # grey levels between a picture and the empty scene
 MOSTLY = 0.5  # of a silhouette that is brighter than the scene, to be light
 OPAQUE, HARDLY = 0.25, 0.03  # of a silhouette that is darker: a body hides what is behind it; light darkens nothing
+FAINT = 0.3  # of a silhouette that differs clearly from the scene, at least: else nothing is seen of it
 SOFT = 0.76  # steepest change over two pixels as a share of the whole one: a body's border is sharper
 REACH_PX, PLACES = 7, 48  # either side of a silhouette, and places along it
 CONTRAST = 8  # grey levels across a border, to say anything
 LEAST_AREA_PX = 30
-REASON = "headlights: in the dark no body was seen, only light"
+REASON = "headlights: in the dark no body was seen"
 
 
 class Headlights:
@@ -52,7 +53,8 @@ class Headlights:
         if not seen:
             return False
         light, dark, softness = np.nanmedian(np.array(seen), axis=0)
-        return bool(light > MOSTLY and (dark < HARDLY or (dark < OPAQUE and softness < SOFT)))
+        shines = light > MOSTLY and (dark < HARDLY or (dark < OPAQUE and softness < SOFT))
+        return bool(shines or light + dark < FAINT)
 
     def _of(self, grey: Array, hull: Array) -> Array | None:
         """Shares of a silhouette (k, 2) px that are brighter and darker than the scene, and how soft its border is."""

@@ -20,6 +20,7 @@ LIT, SAME_HUE = (
     12.0,
 )  # times as bright as its shadow is the lit ground, and grey levels of its colour off that
 SAME_RATIO = 0.05  # of that ratio's logarithm
+NIGHT = 45  # grey levels: half of a scene at night is darker, and what is brighter in it is lit by lamps
 LIT_SHARE = 0.06  # of the pictures in which a place is that much brighter, to take what is seen more often for shadow
 
 
@@ -85,8 +86,8 @@ def _lit(blocks: Image, colour: Array) -> NDArray[np.bool_]:
     ratio = np.einsum("nvuc,vuc->nvu", blocks, colour) / length
     off = np.abs(blocks - ratio[..., None] * colour).max(axis=-1)
     brighter = (ratio > LIT[0]) & (ratio < LIT[1]) & (off < SAME_HUE)
-    if not brighter.any():
-        return brighter
+    if not brighter.any() or np.median(colour) < NIGHT:
+        return np.zeros_like(brighter)
     count, edges = np.histogram(np.log(ratio[brighter]), bins=int(np.log(LIT[1] / LIT[0]) / SAME_RATIO))
     usual = np.log(np.maximum(ratio, 1e-9)) - (edges[np.argmax(count)] + edges[np.argmax(count) + 1]) / 2
     return np.asarray(brighter & (np.abs(usual) < 1.5 * SAME_RATIO))

@@ -21,7 +21,7 @@ LEAST_AGREEING, LEAST_SHARE = 8, 0.15  # of the corners must agree; vehicles hid
 STILL_PX = 0.12  # less is left as it is: laying a picture back softens it
 FAR_PX = 5.0  # a larger turn of the camera is no similarity in the picture any more
 DARK = 16  # grey levels: a scene of which half is darker shows lamps and no corners
-SIDES, KNOCK_PX, KNOCK_SHAKES = 2, 3.0, 3.0  # pictures either side of a knock; px, and times the shake, that it moves
+SIDES, KNOCK_PX, KNOCK_SHAKES = 4, 3.0, 3.0  # pictures either side of a knock; px, and times the shake, that it moves
 COARSE_PX = 320  # width at which a knocked camera is found again
 
 
@@ -140,10 +140,10 @@ def _before_knocks(places: Array) -> int:
         within = []
         for k in range(SIDES, count - SIDES + 1):
             sides = places[:k], places[k:count]
-            within.append(sum(float(np.sum((side - np.median(side, axis=0)) ** 2)) for side in sides))
+            within.append(sum(float(np.linalg.norm(side - np.median(side, axis=0), axis=1).sum()) for side in sides))
         k = SIDES + int(np.argmin(within))
         way = np.linalg.norm(np.median(places[k:count], axis=0) - np.median(places[:k], axis=0))
-        if way < max(KNOCK_PX, KNOCK_SHAKES * float(np.sqrt(min(within) / count))):
+        if way < max(KNOCK_PX, KNOCK_SHAKES * min(within) / count):
             return count
         count = k
     return count

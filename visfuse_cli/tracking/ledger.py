@@ -1,0 +1,99 @@
+"""The ledger of a run: every track that ended as a record and a row, accepted or rejected, with its lane in the end."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime, timedelta
+from typing import Any
+
+import numpy as np
+
+from visfuse_cli.maths.cameras import project
+from visfuse_cli.maths.polygons import Polygon
+from visfuse_cli.records import Array, GroundCamera
+from visfuse_cli.tracking.conclude import conclude
+from visfuse_cli.tracking.dynamics import Dynamics
+from visfuse_cli.tracking.headlights import REASON
+from visfuse_cli.tracking.lanes import Way, find_lanes, lane_of, thinned
+from visfuse_cli.tracking.options import SpeedOptions
+from visfuse_cli.tracking.output import abandoned_row, row_of, track_record
+from visfuse_cli.tracking.targets import Abandoned, Track
+from visfuse_cli.tracking.verdict import judge
+from visfuse_cli.tracking.zones import Region, trusted
+
+SEEN_FRAMES = 8  # a region seen for fewer frames than this is noise and not worth a line in the ledger
+
+
+@dataclass(frozen=True, slots=True)
+class Recording:
+    """What the ledger needs to know of a clip: its name, the name that tracks carry, and when it began."""
+
+    name: str
+    label: str | None
+    camera: GroundCamera
+    began: datetime | None
+    image_from_rest: Callable[[int], Array | None]  # where the camera looked in a frame
+
+
+class Ledger:
+    """Rows of accepted and rejected tracks over all clips of a run; what is kept of a track is small."""
+
+    def __init__(self, config: SpeedOptions) -> None:
+        self.rows: list[dict[str, Any]] = []
+        self.rejected: list[dict[str, Any]] = []
+        self.speeds: list[float] = []  # m/s
+        self.drawn: dict[str, list[tuple[int, int]]] = {}  # clip -> (first frame, id)
+        self._config = config
+        self._region = Region(np.array(config.region)) if config.region else None
+        self._ways: dict[int, Way] = {}  # track -> where it drove while it was measured
+
+    def take(self, track: Track, of: Recording, dynamics: Dynamics, only_light: bool) -> dict[str, Any] | None:
+        """Conclude and judge a track; its record for tracks.json, None where it never was in the region."""
+        config, camera = self._config, of.camera
+        whole = conclude(track, camera, config, dynamics)
+        path = whole if self._region is None else self._region.part(whole)
+        if path is None:
+            return None
+        position = path.planar.mean[:, :2]
+        zone = trusted(camera, position, config.pose.bias_px, config.speed.max_calibration)
+        verdict = judge(path, camera.ground.cov, config.pose.bias_px, config.speed, zone)
+        if only_light:
+            verdict = replace(verdict, reason=REASON)
+        self.drawn.setdefault(of.name, []).append((int(path.frame[0]), path.id))
+        self._ways[path.id] = thinned(position[verdict.first : verdict.last + 1])
+        row = row_of(path, verdict, of.name, utc(of.began, path.t[verdict.first]))
+        (self.rejected if verdict.reason else self.rows).append(row)
+        self.speeds += [] if verdict.reason else [verdict.speed]
+        return track_record(path, verdict, camera, of.label, of.image_from_rest, config.latency)
+
+    def give_up(self, candidate: Abandoned, of: Recording) -> None:
+        """Note what never became a track, unless it was noise or outside of the region."""
+        place = candidate.position
+        inside = place is not None and (self._region is None or bool(self._region.holds(np.array(place))))
+        if inside and candidate.n_frames >= SEEN_FRAMES:
+            self.rejected.append(abandoned_row(candidate, of.name, utc(of.began, candidate.t_start)))
+
+    def found_lanes(self, camera: GroundCamera) -> tuple[Polygon, ...]:
+        """Lanes from where the vehicles of all clips drove, if that is asked for and there were enough of them."""
+        if not self._config.lane_finding.find or self._config.target.motion != "bicycle":
+            return ()
+
+        def image_of(ground: Array) -> Array:
+            return project(camera, np.column_stack([ground, np.zeros(len(ground))]))[0]
+
+        return find_lanes([self._ways[row["track_id"]] for row in self.rows], self._config.lane_finding, image_of)
+
+    def give_lanes(self, lanes: Sequence[Polygon]) -> None:
+        """Tell each track its lane."""
+        for row in (*self.rows, *self.rejected):
+            if row["track_id"] in self._ways:
+                row["lane"] = lane_of(self._ways[row["track_id"]], lanes)
+
+
+def utc(began: datetime | None, t: float) -> str:
+    """The time of day (ISO 8601, Z) t s after a recording began; empty where nobody knows."""
+    if began is None:
+        return ""
+    moment = (began + timedelta(seconds=float(t))).astimezone(UTC)
+    return moment.isoformat(timespec="milliseconds").replace("+00:00", "Z")
