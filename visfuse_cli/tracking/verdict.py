@@ -15,6 +15,8 @@ from visfuse_cli.records import Array
 from visfuse_cli.tracking.conclude import Path
 
 Z95 = 1.959964
+STANDS = 0.3  # m/s
+TURN_M = 0.25  # m a radian: the middle of a fitted box shifts as the vehicle shows another side
 SIZE_DOUBT = 0.03  # of a size: no vehicle is quite a box
 GOOD_ENOUGH, LONGER_FOR = 0.01, 1.5  # standard deviation of a speed over itself
 DOUBTFUL_ENDS, SHORT_S = ("jumped", "no longer looks like itself"), 1.0  # s: a track that does so sooner is nothing
@@ -68,7 +70,7 @@ def judge(path: Path, entry_cov: Array, bias_px: float, settings: SpeedSettings,
     GOOD_ENOUGH, or LONGER_FOR times the least.
     """
     position, velocity = path.planar.mean[:, :2], path.planar.mean[:, 2:]
-    tangent = velocity / np.maximum(np.linalg.norm(velocity, axis=1, keepdims=True), 1e-6)
+    tangent = _tangents(velocity)
     length = way(position, tangent)
     first, last, sigma = _best_stretch(path, length, tangent, entry_cov, bias_px, settings)
     duration = path.t[last] - path.t[first]
@@ -109,12 +111,24 @@ def _best_stretch(
     stretch = np.einsum("td,tdp->tp", tangent, path.size_pull)  # m along the way for a metre of size
     doubt_of_size = np.hypot(path.size_sigma, SIZE_DOUBT * path.size)
     size = np.sum((doubt_of_size * (stretch[j] - stretch[i])) ** 2, axis=1)
+    angle = np.unwrap(np.arctan2(tangent[:, 1], tangent[:, 0]))
+    turned = (TURN_M * (angle[j] - angle[i])) ** 2
     stamps = 2 * (distance / np.maximum(duration, 1e-9) * settings.sigma_t_s) ** 2
-    sigma_way = np.sqrt(pose + np.clip(calibration, 0, None) + bias + size + stamps)
+    sigma_way = np.sqrt(pose + np.clip(calibration, 0, None) + bias + size + turned + stamps)
     doubt = sigma_way / np.maximum(distance, 1e-3)
     good = doubt <= max(LONGER_FOR * float(doubt.min()), GOOD_ENOUGH)
     best = int(np.argmax(np.where(good, distance, -np.inf)))
     return int(i[best]), int(j[best]), float(sigma_way[best] / max(duration[best], 1e-9))
+
+
+def _tangents(velocity: Array) -> Array:
+    """Unit directions (T, 2) of the way; what stands keeps the one it came with, so that its trembling is no way."""
+    speed = np.linalg.norm(velocity, axis=1)
+    moves = np.flatnonzero(speed > STANDS)
+    if not len(moves):
+        moves = np.array([int(np.argmax(speed))])
+    last = moves[np.clip(np.searchsorted(moves, np.arange(len(speed)), side="right") - 1, 0, None)]
+    return np.asarray(velocity[last] / np.maximum(speed[last], 1e-6)[:, None])
 
 
 def _reason(path: Path, verdict: Verdict, settings: SpeedSettings, trusted: bool) -> str:
