@@ -1,6 +1,7 @@
 """Nights of cron in a few minutes: `python benchmarks/cron.py --clips 30 --kills 20`.
 
-Clips arrive piece by piece in random order while `speed --new-only` runs overlap and are killed (SIGKILL) at random
+Clips arrive piece by piece in random order (lanes that are found need --in-order: the first clip to show enough
+vehicles finds them for all) while `speed --new-only` runs overlap and are killed (SIGKILL) at random
 instants. In the end the log's export, and every clip's own results, must equal those of one run over all clips that
 nobody disturbed, byte for byte.
 """
@@ -126,6 +127,8 @@ def main() -> None:
     parser.add_argument("--clips", type=int, default=30)
     parser.add_argument("--kills", type=int, default=20)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--in-order", action="store_true", help="clips arrive in the order of their names")
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="of the speed command")
     parser.add_argument("--keep", type=Path, help="folder for all of it, instead of a temporary one")
     arguments = parser.parse_args()
     rng = random.Random(arguments.seed)
@@ -133,12 +136,14 @@ def main() -> None:
         folder = arguments.keep or Path(temporary)
         homography = make_clips(folder, arguments.clips)
         order = sorted(path.name for path in (folder / "clips").iterdir())
-        rng.shuffle(order)
+        if not arguments.in_order:
+            rng.shuffle(order)
         span_s = 6.0 * arguments.kills
         arriving = threading.Thread(target=arrive, args=(folder / "clips", folder / "in", order, rng, span_s))
         arriving.start()
         time.sleep(0.1)
-        common = ("--homography", homography, *OPTIONS)
+        settings = [part for each in arguments.set for part in ("--set", each)]
+        common = ("--homography", homography, *OPTIONS, *settings)
         command = ["speed", folder / "in", *common, "--log", folder / "night.sqlite", "--out", folder / "night"]
         night = Night([*VISFUSE, *map(str, command)], rng)
         killed = night.rehearse(arguments.kills, arriving)

@@ -15,6 +15,7 @@ from pathlib import Path
 import pytest
 
 from visfuse_cli.apps.batch import work
+from visfuse_cli.apps.batch.cluster import connected
 from visfuse_cli.apps.batch.manifest import read_manifest
 from visfuse_cli.errors import InputError, UsageError
 from visfuse_cli.threads import thread_cap
@@ -184,6 +185,12 @@ def test_a_cap_that_is_none_is_refused(value, monkeypatch):
     monkeypatch.setenv("VISFUSE_THREADS", value)
     with pytest.raises(UsageError, match="VISFUSE_THREADS"):
         thread_cap()
+
+
+def test_without_dask_a_batch_is_one_line(monkeypatch):
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    with pytest.raises(UsageError, match=r"pip install 'visfuse-cli\[batch\]'"), connected(1, None):
+        pass
 
 
 def visfuse(*args, **more):

@@ -3,6 +3,7 @@
 import csv
 import io
 import json
+import sys
 
 import numpy as np
 import pytest
@@ -209,6 +210,14 @@ def test_a_log_is_exported_in_order_whatever_the_order_of_writing(tmp_path):
 def test_a_wrong_export_is_refused(run, form, more, error, message):
     with pytest.raises(error, match=message):
         export(run, form, None, **more)
+
+
+@pytest.mark.parametrize(("form", "library"), [("parquet", "pyarrow"), ("geojson", "pyproj"), ("gpkg", "shapely")])
+def test_without_its_library_a_form_is_one_line(form, library, run, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, library, None)
+    with pytest.raises(UsageError, match=r"pip install 'visfuse-cli\["):
+        export(run, form, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
 
 
 def test_what_cannot_be_exported_is_said(run, tmp_path):
