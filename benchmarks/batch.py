@@ -124,9 +124,9 @@ def main() -> None:
             print(f"ratio {one[0] / two[0]:.2f}", flush=True)
         killed = Path(temporary) / "killed"
         run(arguments.scenes, killed, 2, kill=True)
-        equal = same(Path(temporary) / "0-1", killed)
         begins = [log.read_text().count(" process ") for log in killed.glob("*/batch.log")]
-        print(f"{len(begins)} items, begun {sum(begins)} times with one worker killed; {equal} result files equal")
+        print(f"{len(begins)} items, begun {sum(begins)} times with one worker killed")
+        print(f"{same(Path(temporary) / '0-1', killed)} result files equal")
     print(f"median ratio {statistics.median(ratios):.2f} over {len(ratios)} rounds")
 
 
