@@ -10,7 +10,14 @@ from typing import Any
 import cv2
 import numpy as np
 
-from visfuse_cli.commands.track_imm.scene import check_covered, check_inside, check_size, named_targets, open_views
+from visfuse_cli.commands.track_imm.scene import (
+    check_covered,
+    check_inside,
+    check_kind,
+    check_size,
+    named_targets,
+    open_views,
+)
 from visfuse_cli.errors import InputError
 from visfuse_cli.files import homography
 from visfuse_cli.files.lens_files import read_lens
@@ -22,6 +29,7 @@ from visfuse_cli.files.video_writer import VideoWriter
 from visfuse_cli.gazing.annotate import Drawn, inset
 from visfuse_cli.gazing.conclude import conclude
 from visfuse_cli.gazing.head import rest
+from visfuse_cli.gazing.models import KINDS
 from visfuse_cli.gazing.tracker import Tracker
 from visfuse_cli.moving.settings import ImmConfig
 from visfuse_cli.pipeline import Run
@@ -39,6 +47,7 @@ class PanTiltRun:
     def __init__(self, request: RunRequest, sensor_file: Path, sensors: Sensors) -> None:
         folder = request.input
         self._config: ImmConfig = request.config
+        check_kind(self._config.filter.kind, tuple(KINDS), "pan-tilt")
         self._sensor_file, self.sensors = sensor_file, sensors
         self.views = {"left": view(folder, "left")}
         calibration = file(folder, FILES, "calibration of the camera (M1, D1)")

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from visfuse_cli.errors import InputError
+from visfuse_cli.errors import InputError, UsageError
 from visfuse_cli.files.scene import find_file
 from visfuse_cli.files.sensors import Sensors
 from visfuse_cli.files.stereo_scene import read_init
@@ -18,6 +18,12 @@ from visfuse_cli.vision import patches
 INIT = ("init.yaml", "init.yml")
 BEYOND_S = 0.5  # s that footage may go on beyond the sensors
 MIDDLE = (0.3, 0.7)  # of the picture, where a principal point lies
+
+
+def check_kind(kind: str, known: Sequence[str], head: str) -> None:
+    """Raises UsageError where a motion is asked for that this head has not."""
+    if kind not in ("imm", *known):
+        raise UsageError(f"filter.kind={kind} is no motion of a {head} head; it has imm, {', '.join(known)}")
 
 
 def open_views(views: dict[str, Path], request: RunRequest) -> dict[str, VideoSource]:

@@ -13,6 +13,7 @@ import numpy as np
 from visfuse_cli.commands.track_imm.scene import (
     check_covered,
     check_inside,
+    check_kind,
     check_size,
     named_targets,
     open_views,
@@ -26,6 +27,7 @@ from visfuse_cli.files.video_writer import VideoWriter
 from visfuse_cli.moving.annotate import Drawn, inset, together
 from visfuse_cli.moving.conclude import conclude, track_record
 from visfuse_cli.moving.journey import journey
+from visfuse_cli.moving.models import INDEX
 from visfuse_cli.moving.settings import ImmConfig
 from visfuse_cli.moving.target import Head, Target
 from visfuse_cli.moving.tracker import Tracker
@@ -45,6 +47,7 @@ class StereoRun:
     def __init__(self, request: RunRequest, sensor_file: Path, sensors: Sensors) -> None:
         folder = request.input
         self._config: ImmConfig = request.config
+        check_kind(self._config.filter.kind, tuple(INDEX), "stereo")
         self._sensor_file, self.sensors = sensor_file, sensors
         calibration = file(folder, FILES, "calibration of the pair")
         self._rig = read_rig(calibration)
@@ -146,9 +149,14 @@ def _straight(quad: Array | None, lens: Lens) -> Array | None:
 
 def _pairs(sources: dict[str, VideoSource], run_: Run) -> Iterator[FrameSet]:
     tolerance = AGREE / max(source.nominal_rate for source in sources.values())
+    alone = 0
     for pair in run_.synchronise(sources, tolerance):
-        if not pair.missing:
+        if pair.missing:
+            alone += 1
+        else:
             yield pair
+    if alone:
+        run_.warn(f"{alone} left frames have no right one within {tolerance:.3f} s; they are left out")
 
 
 class _Pictures:
