@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from visfuse_cli.gazing.head import ground_shift
-from visfuse_cli.gazing.target import Target, belief
+from visfuse_cli.gazing.target import Look, Target, belief
 from visfuse_cli.maths import gaussian, motion
 from visfuse_cli.records import Array, Gaussian, GroundMap
 
@@ -17,34 +18,60 @@ SETTLED_S = 1.0
 SLOWEST = 0.12  # m/s
 
 
+@dataclass(frozen=True, slots=True)
+class _Part:
+    """What was seen of a target without a break: looks, beliefs mean (T, 4) and cov (T, 4, 4), log mu, predictions."""
+
+    looks: list[Look]
+    mean: Array
+    cov: Array
+    log_mu: Array
+    ahead: list[Gaussian | None]
+
+
 def conclude(target: Target, ground: GroundMap) -> dict[str, Any] | None:
     """One track of tracks.json; None where it was seen too rarely, or was found unaided and went nowhere."""
+    chain = [target]
+    while (earlier := chain[-1].earlier) is not None:
+        chain.append(earlier)
+    parts = [part for each in chain[::-1] if (part := _part(each, ground)) is not None]
+    looks = [look for part in parts for look in part.looks]
+    seen = np.array([look.z is not None for look in looks])
     life = target.config.life
-    seen = np.array([look.z is not None for look in target.looks])
-    if not target.steps or np.count_nonzero(seen) < life.min_frames:
+    if np.count_nonzero(seen) < life.min_frames:
         return None
-    last = int(np.flatnonzero(seen)[-1]) + 1
-    looks, steps = target.looks[:last], target.steps[:last]
-    banks = target.models.smoothed(steps) if target.config.smooth else [step.filtered for step in steps]
-    beliefs = [belief(bank) for bank in banks]
-    mean, cov = np.stack([b.mean for b in beliefs]), np.stack([b.cov for b in beliefs])
-    J = ground_shift(ground, mean[:, :2])
-    of_map = J @ ground.cov @ np.swapaxes(J, 1, 2)
-    cov[:, :2, :2] += of_map
+    mean, cov, log_mu = (np.concatenate([getattr(part, name) for part in parts]) for name in ("mean", "cov", "log_mu"))
+    ahead = [each for part in parts for each in part.ahead]
     t = np.array([look.t for look in looks])
     duration = float(t[-1] - t[0])
     distance = float(np.sum(np.hypot(*np.diff(mean[:, :2], axis=0).T)))
     net = float(np.hypot(*(mean[-1, :2] - mean[0, :2])))
     if not target.given and (net < life.min_moved or net < SLOWEST * duration):
         return None
+    names = target.models.names
     return {
         "id": target.id,
-        "summary": _summary(target, t, seen[:last], distance, duration, cov),
+        "summary": _summary(target, t, seen, distance, duration, cov),
         "states": [
-            _state(target, k, mean[k], cov[k], dict(zip(target.models.names, np.exp(banks[k].log_mu), strict=True)))
-            for k in range(last)
+            _state(target, looks[k], ahead[k], mean[k], cov[k], dict(zip(names, np.exp(log_mu[k]), strict=True)))
+            for k in range(len(looks))
         ],
     }
+
+
+def _part(target: Target, ground: GroundMap) -> _Part | None:
+    """What was seen of a target without a break, up to its last measurement; None where that is next to nothing."""
+    measured = [k for k, look in enumerate(target.looks) if look.z is not None]
+    if not target.steps or len(measured) < 2:
+        return None
+    last = measured[-1] + 1
+    steps = target.steps[:last]
+    banks = target.models.smoothed(steps) if target.config.smooth else [step.filtered for step in steps]
+    beliefs = [belief(bank) for bank in banks]
+    mean, cov = np.stack([b.mean for b in beliefs]), np.stack([b.cov for b in beliefs])
+    J = ground_shift(ground, mean[:, :2])
+    cov[:, :2, :2] += J @ ground.cov @ np.swapaxes(J, 1, 2)
+    return _Part(target.looks[:last], mean, cov, np.stack([bank.log_mu for bank in banks]), target.ahead[:last])
 
 
 def _summary(target: Target, t: Array, seen: Array, distance: float, duration: float, cov: Array) -> dict[str, Any]:
@@ -67,8 +94,9 @@ def _summary(target: Target, t: Array, seen: Array, distance: float, duration: f
     }
 
 
-def _state(target: Target, k: int, mean: Array, cov: Array, models: dict[str, float]) -> dict[str, Any]:
-    look, later = target.looks[k], target.ahead[k]
+def _state(
+    target: Target, look: Look, later: Gaussian | None, mean: Array, cov: Array, models: dict[str, float]
+) -> dict[str, Any]:
     speed = float(np.hypot(*mean[2:]))
     unit = mean[2:] / max(speed, 1e-6)
     state: dict[str, Any] = {

@@ -22,11 +22,12 @@ KNOWN = 0.2  # overlap with what is followed already
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """One frame: its number, time, gaze, pyramid of grey pictures, and what was followed in it, boxes [x, y, w, h]."""
+    """One frame: its number, time, gaze, picture and grey pyramid, and what was followed in it, boxes [x, y, w, h]."""
 
     frame: int
     t: float
     gaze: Array
+    picture: Image
     levels: list[Grey]
     known: list[Array]
 

@@ -15,8 +15,11 @@ from visfuse_cli.maths.imm import Bank, Step
 from visfuse_cli.moving.settings import ImmConfig
 from visfuse_cli.records import Array, Gaussian
 from visfuse_cli.vision import patches
-from visfuse_cli.vision.patches import Template
+from visfuse_cli.vision.boxes import box_of
+from visfuse_cli.vision.looks import ALIKE, COASTED_S, HIDDEN, KEEP_LOOKS, SETTLED_S, looks, unlike
+from visfuse_cli.vision.patches import Alignment, Template
 
+FASTER, FAST, SLACK_M = 2.0, 1.5, 0.5  # times its pace, m/s, m: how far a lost target may have come
 YOUNG = 6  # measurements from which the first place and velocity are estimated
 GATE = 1 - 1e-6
 TRUST = 4.0  # times an alignment's own covariance
@@ -36,6 +39,16 @@ class Look:
     R: Array
 
 
+@dataclass(frozen=True, slots=True)
+class Expected:
+    """Where a target is thought to be: the step that led there (if the bank has begun), quad (4, 2) px, depth m, s."""
+
+    step: Step | None
+    quad: Array
+    depth: float
+    dt: float
+
+
 @dataclass(slots=True)
 class Target:
     """A target that is followed; `size` (2,) m of what is seen of it; a step of the bank for each look, once begun."""
@@ -47,13 +60,16 @@ class Target:
     size: Array
     place: Array  # (2,) m, while the bank has not begun
     sought: Template
+    colours: Array  # (bands, 3): what it looks like
     given: bool
     last_seen: float
+    seen_since: float = -np.inf  # s: since when it is seen without a break
     looks: list[Look] = field(default_factory=list)
     steps: list[Step] = field(default_factory=list)
     nis: list[float] = field(default_factory=list)
     ahead: list[Gaussian | None] = field(default_factory=list)  # the belief a latency later, look by look
     ended_by: str = ""
+    earlier: Target | None = None  # what was seen of it before it was lost or away
 
     @property
     def height(self) -> float:
@@ -76,8 +92,8 @@ def start(
     identity: int, head: Head, config: ImmConfig, models: Courses, view: View, quad: Array, given: bool
 ) -> Target | None:
     """Begin with a target in a quad (4, 2) px of a view; None where it is not on the ground."""
-    sought = patches.holding(view.levels, quad)
-    target = Target(identity, head, config, models, np.ones(2), np.zeros(2), sought, given, view.t)
+    sought, colours = patches.holding(view.levels, quad), looks(view.picture, quad)
+    target = Target(identity, head, config, models, np.ones(2), np.zeros(2), sought, colours, given, view.t)
     at = target.anchor(quad)
     place = head.ground(at, view.gaze, target.height)
     if not np.isfinite(place).all():
@@ -85,21 +101,27 @@ def start(
     target.place = place
     target.size = np.array(patches.side(quad)) * head.depth(place, target.height) / np.diag(head.lens.K)[:2]
     measured = _measured(target, at, np.zeros((2, 2)), view.gaze, None)
-    target.looks.append(Look(view.frame, view.t, view.gaze, _box(quad), *measured))
+    target.looks.append(Look(view.frame, view.t, view.gaze, box_of(quad), *measured))
     return target
 
 
-def follow(target: Target, view: View) -> None:
-    """One frame further: predict, look, update."""
+def expect(target: Target, view: View) -> Expected:
+    """Where the target is thought to be in a view."""
     dt = view.t - target.looks[-1].t
     step = target.models.predict(target.steps[-1].filtered, dt) if target.steps else None
     place = combined(step.filtered).mean[:2] if step is not None else target.place
-    quad = target.quad_at(place, view.gaze)
-    found = patches.follow(view.levels, quad, target.sought, STRETCH, target.config.measure.good)
+    return Expected(step, target.quad_at(place, view.gaze), target.head.depth(place, target.height), dt)
+
+
+def follow(target: Target, view: View, expected: Expected, hidden: float) -> None:
+    """One frame further: look where it is expected, unless too large a share of it is hidden by others, and update."""
+    step, quad, dt = expected.step, expected.quad, expected.dt
+    found = _seen(target, view, quad) if hidden < HIDDEN else None
     z, R = None, np.zeros((4, 4))
     if found is not None:
         seen = found.quad(quad)
-        z, R = _measured(target, target.anchor(seen), TRUST * found.cov[:2, :2], view.gaze, dt)
+        aside = np.diag([(hidden * patches.side(seen)[0]) ** 2, 0.0])  # what is left to be seen lies to one side
+        z, R = _measured(target, target.anchor(seen), TRUST * found.cov[:2, :2] + aside, view.gaze, dt)
         quad = seen if z is not None else quad
     if step is not None:
         updated = _updated(step, z, R) if z is not None else None
@@ -110,13 +132,42 @@ def follow(target: Target, view: View) -> None:
             target.nis.append(updated[1])
         target.steps.append(step)
         target.ahead.append(_later(target))
-    target.looks.append(Look(view.frame, view.t, view.gaze, _box(quad), z, R))
+    target.looks.append(Look(view.frame, view.t, view.gaze, box_of(quad), z, R))
     if z is not None and found is not None:
+        target.seen_since = target.seen_since if target.looks[-2].z is not None else view.t
         target.place, target.last_seen = z[:2], view.t
-        if found.correlation < target.config.measure.fresh:
+        target.colours = KEEP_LOOKS * target.colours + (1 - KEEP_LOOKS) * looks(view.picture, quad)
+        if found.correlation < target.config.measure.fresh and view.t - target.seen_since > SETTLED_S:
             target.sought = patches.holding(view.levels, quad)
     if not target.steps and sum(look.z is not None for look in target.looks) >= YOUNG:
         _begin(target)
+
+
+def _seen(target: Target, view: View, quad: Array) -> Alignment | None:
+    """The target near a quad (4, 2); after some time unseen, only what looks as it did."""
+    found = patches.follow(view.levels, quad, target.sought, STRETCH, target.config.measure.good)
+    if found is None or view.t - target.last_seen <= COASTED_S:
+        return found
+    return found if unlike(target.colours, looks(view.picture, found.quad(quad))) < ALIKE else None
+
+
+def found_again(target: Target, view: View, quad: Array) -> Array | None:
+    """The quad (4, 2) of a target that was lost, in what moves in `quad`; None where it is not it, or cannot be."""
+    place = target.head.ground(target.anchor(quad), view.gaze, target.height)
+    if not np.isfinite(place).all():
+        return None
+    pace = (
+        max(FASTER * float(np.linalg.norm(belief(target.steps[-1].filtered).mean[2:])), FAST) if target.steps else FAST
+    )
+    away = target.head.depth(place, target.height)
+    if np.linalg.norm(place - target.place) > 0.1 * away + SLACK_M + pace * (view.t - target.last_seen):
+        return None
+    moved = patches.searched(
+        view.levels[0], target.quad_at(place, view.gaze), target.sought, patches.SEARCH, target.config.measure.good
+    )
+    if moved is None or unlike(target.colours, looks(view.picture, moved)) >= ALIKE:
+        return None
+    return moved
 
 
 def _measured(target: Target, at: Array, cov: Array, gaze: Array, dt: float | None) -> tuple[Array | None, Array]:
@@ -182,8 +233,3 @@ def belief(bank: Bank) -> Gaussian:
     one = combined(bank)
     mean, J = course.observe(one.mean)
     return Gaussian(mean, J @ one.cov @ J.T)
-
-
-def _box(quad: Array) -> Array:
-    low, top = quad.min(axis=0), quad.max(axis=0)
-    return np.concatenate([low, top - low])

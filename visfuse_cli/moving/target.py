@@ -15,8 +15,9 @@ from visfuse_cli.moving.models import SIZE, Models, P, V
 from visfuse_cli.moving.settings import ImmConfig
 from visfuse_cli.records import Array, Gaussian, Image, StereoRig
 from visfuse_cli.vision import patches
+from visfuse_cli.vision.boxes import box_of
 from visfuse_cli.vision.disparity import region_shift
-from visfuse_cli.vision.looks import looks, unlike
+from visfuse_cli.vision.looks import ALIKE, COASTED_S, HIDDEN, KEEP_LOOKS, SETTLED_S, looks, unlike
 from visfuse_cli.vision.patches import Alignment, Grey, Template
 
 STEP = 1e-3  # m, m/s: of the numerical Jacobian
@@ -25,13 +26,8 @@ STRETCH = 0.2  # by which a target's picture may be off the size that its distan
 TRUST = 4.0  # times an alignment's own covariance
 NEAREST = 0.2  # m before the camera
 REACH = 3.0  # px of disparity around the expected one, at least
-HIDDEN = 0.2  # share of a target's box that others cover: from there on it is not looked for
 FLOW_RIM = 4.0  # px from the edge of the picture, within which there is no saying what its flow is
-COASTED_S = 0.25  # after which a target that is found again must look as it did
 FASTER, FAST, SLACK_M = 2.0, 1.5, 0.5  # times its pace, m/s, m: how far a lost target may have come
-ALIKE = 30.0  # grey levels: looks that differ by less may be of one thing
-SETTLED_S = 0.4  # s after it was found again, from which on its template is taken anew: it comes out bit by bit
-KEEP_LOOKS = 0.95  # of what a target looked like, from frame to frame
 
 
 @dataclass(frozen=True, slots=True)
@@ -321,9 +317,3 @@ def _refresh(target: Target, pair: Pair, left: Array, found: Alignment) -> None:
     target.looks = KEEP_LOOKS * target.looks + (1 - KEEP_LOOKS) * looks(pair.pictures["left"], left)
     if found.correlation < target.config.measure.fresh and pair.head.t - target.seen_since > SETTLED_S:
         target.sought = patches.holding(pair.levels, left)
-
-
-def box_of(quad: Array) -> Array:
-    """[x, y, w, h] around a quad (4, 2)."""
-    low, top = quad.min(axis=0), quad.max(axis=0)
-    return np.concatenate([low, top - low])

@@ -15,7 +15,9 @@ from visfuse_cli.moving.target import Head, Pair, Target
 from visfuse_cli.records import Array, Gaussian, GivenTarget, Image, StereoRig
 from visfuse_cli.vision import flow as optical
 from visfuse_cli.vision import patches
+from visfuse_cli.vision.boxes import box_of, covered
 from visfuse_cli.vision.epipolar_match import match
+from visfuse_cli.vision.looks import COASTED_S, HIDDEN
 
 # Two targets that share so much of a box, are so near (m), and go so much alike (m/s) for so long (s) are one.
 TWINS_SHARE, TWINS_M, TWINS_SPEED, TWINS_S = 0.25, 0.45, 0.4, 0.4
@@ -80,10 +82,10 @@ class Tracker:
         expected = [(one.expect(each, pair.head), each) for each in self._followed]
         taken: list[Array] = []  # boxes
         for where, target in sorted(expected, key=lambda pair: pair[0].depth):
-            own = one.box_of(where.quads["left"]) if where.quads else None
+            own = box_of(where.quads["left"]) if where.quads else None
             hidden = max((covered(own, box) for box in taken), default=0.0) if own is not None else 0.0
             one.follow(target, pair, where, hidden)
-            if target.history[-1].boxes and (target.history[-1].measured or hidden < one.HIDDEN):
+            if target.history[-1].boxes and (target.history[-1].measured or hidden < HIDDEN):
                 taken.append(target.history[-1].boxes["left"])
 
     def _begin_given(self, pair: Pair) -> None:
@@ -142,7 +144,7 @@ class Tracker:
         return not target.given and t - target.alone_at > TWINS_S
 
     def _lost(self, t: float) -> list[Target]:
-        return [each for each in self._followed if t - each.last_seen > one.COASTED_S]
+        return [each for each in self._followed if t - each.last_seen > COASTED_S]
 
     def _match(self, pair: Pair, quad: Array) -> Array | None:
         """The right quad (4, 2) of a left one, over all depths."""
@@ -167,12 +169,6 @@ class Tracker:
 def _grown(box: Array) -> Array:
     """A box [x, y, w, h] and a third of it to both sides."""
     return box + np.array([-1 / 3, 0, 2 / 3, 0]) * box[2]
-
-
-def covered(box: Array, other: Array) -> float:
-    """The share of a box [x, y, w, h] that another one covers."""
-    low, top = np.maximum(box[:2], other[:2]), np.minimum(box[:2] + box[2:], other[:2] + other[2:])
-    return float(np.prod(np.clip(top - low, 0, None)) / max(float(np.prod(box[2:])), 1e-9))
 
 
 def dense_flow(before: Image, after: Image, settings: FlowSettings) -> Array:

@@ -11,6 +11,11 @@ from visfuse_cli.vision import patches
 BANDS = 5  # from top to bottom
 INNER = 0.5  # share of the width that they cover
 SAMPLES = 6  # of each band, both ways
+HIDDEN = 0.2  # share of a target's box that others cover: from there on it is not looked for
+COASTED_S = 0.25  # after which a target that is found again must look as it did
+ALIKE = 30.0  # grey levels: looks that differ by less may be of one thing
+SETTLED_S = 0.4  # s after it was found again, from which on its template is taken anew: it comes out bit by bit
+KEEP_LOOKS = 0.95  # of what a target looked like, from frame to frame
 
 
 def looks(picture: Image, quad: Array) -> Array:
