@@ -52,7 +52,7 @@ class FilterSettings(Section):
     )
     stay: float = Field(0.985, gt=0.5, lt=1, description="probability that a model goes on over one frame")
     q_drifting: float = Field(0.2, gt=0, description="m^2/s of a drifting point's walk")
-    q_cv: float = Field(0.1, gt=0, description="m^2 s^-3 of constant velocity: for straight ways")
+    q_cv: float = Field(0.05, gt=0, description="m^2 s^-3 of constant velocity: for straight ways")
     q_ca: float = Field(4.0, gt=0, description="m^2 s^-5 of constant acceleration")
     q_periodic: float = Field(0.05, gt=0, description="m^2 s^-3 of the periodic motion")
     omega: float = Field(1.0, gt=0, le=50, description="rad/s of the periodic motion")
