@@ -21,7 +21,7 @@ COEFFICIENTS = (4, 5, 8, 12, 14)  # lengths of OpenCV's distortion
 def write(path: Path, ground: GroundMap) -> None:
     """Write H.json; raises OutputError where it cannot be written."""
     lens = None if ground.lens is None else {"K": ground.lens.K.tolist(), "D": ground.lens.D.tolist()}
-    document = {
+    document: dict[str, Any] = {
         "schema": SCHEMA,
         "input": ground.input,
         "image_size": None if ground.image_size is None else list(ground.image_size),
@@ -33,8 +33,9 @@ def write(path: Path, ground: GroundMap) -> None:
         "rms_px": ground.rms_px,
         "residuals": list(ground.residuals),
         "source": ground.source,
-        "crs": None if ground.reference is None else asdict(ground.reference),
     }
+    if ground.reference is not None:
+        document["crs"] = asdict(ground.reference)
     write_json(path, document)
 
 
