@@ -20,7 +20,7 @@ Index = NDArray[np.intp]
 ALONG, SPEED, RIGHT, UP = range(4)
 ROUNDS = 6  # of linearisation, weights and noise anew
 FREEDOM = 2.0  # of Student's t: how often a piece is seen where it is not
-FLOOR_PX = 0.03
+FLOOR_PX, LEAST = 0.03, 0.05  # px, of every sighting; least square of the noise in units of the expected
 SHY = 3.0  # sightings that the usual noise stands for in a piece's own
 STEP = 0.01  # m, of the numerical derivative along the way
 LOOSE = np.array([1e3, 80.0, 20.0, 20.0])  # of the first state
@@ -103,6 +103,7 @@ def adjust(rig: StereoRig, way: Way, seen: Sightings, rules: Rules, sigma_v: flo
         J, r = _rows(rig, way, seen, states, pieces)
         used = float(np.sum(cov * data.T))
         noise2 = float(np.sum(weight * np.sum(r**2, axis=1)) / max(4 * len(r) - used, 4.0))
+        noise2 = max(noise2, LEAST)  # nothing is known better than that, and the sums stay well conditioned
         shared = _shared(seen, r / np.sqrt(noise2 * own[seen.piece, None]))
     cov = cov[: 4 * T, : 4 * T]
     return Adjusted(states, (cov + cov.T) / 2, pieces, float(np.sqrt(noise2 * shared)), rules.sigma_v, rules.relief)

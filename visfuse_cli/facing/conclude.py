@@ -59,9 +59,13 @@ def conclude(target: Target) -> Settled | None:
         target = _with_way(target)
     t = np.array([look.t for look in target.looks])
     start = _start(target, t)
-    adjusted = adjust(
-        target.rig, target.way, _sightings(target, t), _rules(target, start), target.config.filter.sigma_v, start
-    )
+    sigma_v = target.config.filter.sigma_v
+    try:
+        adjusted = adjust(target.rig, target.way, _sightings(target, t), _rules(target, start), sigma_v, start)
+    except np.linalg.LinAlgError:  # sightings that fit no motion at all
+        return None
+    if not np.isfinite(adjusted.states).all():
+        return None
     settled = _settled(target, t, adjusted)
     if not target.given and not _moved(target, settled):
         return None
