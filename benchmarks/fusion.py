@@ -21,7 +21,7 @@ from scipy.optimize import linear_sum_assignment
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from samples.people import crossing
+from samples.people import crossing, varied
 from samples.yard import write_yard
 from tests.test_fusion import simulate
 
@@ -33,6 +33,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seeds", type=int, default=10)
     parser.add_argument("--runs", type=int, default=200, help="of the simulation")
+    parser.add_argument("--varied", action="store_true", help="bodies, light, ground, cameras and noise drawn by lot")
+    parser.add_argument("--method", choices=METHODS, default="closed-loop", help="of the rendered yards")
     args = parser.parse_args()
     found = simulate(list(METHODS), runs=args.runs)
     print(f"{'simulated':<24} {'MSE / bound':>12} {'NEES (6 is right)':>18}")
@@ -44,11 +46,12 @@ def main() -> None:
     for seed in range(args.seeds):
         with tempfile.TemporaryDirectory() as folder:
             scene, out = Path(folder) / "scene", Path(folder) / "run"
-            yard = crossing(seed)
+            yard = varied(seed) if args.varied else crossing(seed)
             write_yard(yard, scene)
             begun = time.perf_counter()
             command = [sys.executable, "-m", "visfuse_cli", "fuse-cameras", str(scene), "--out", str(out)]
-            subprocess.run([*command, "--no-video", "--no-report", "-q"], check=True)
+            chosen = ["--set", f"fusion.method={args.method}"]
+            subprocess.run([*command, *chosen, "--no-video", "--no-report", "-q"], check=True)
             ratio = yard.seconds / (time.perf_counter() - begun)
             row = [len(yard.walkers), *score(scene / "truth.csv", out / "tracks.json"), ratio]
         totals.append(row)
