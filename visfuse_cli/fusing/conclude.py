@@ -23,8 +23,8 @@ from visfuse_cli.records import Array, Gaussian
 
 DENIED = 1  # camera or more with a clear sight that speak against a prediction
 BODY_SIGMA = 0.0035  # m, times the root of the noise found: what cameras err alike, as by feet that point ahead
-UPRIGHT_SIGMA = 0.006  # m: heads are not as round as they are taken to be, nor is the ground as flat
-EDGE_PX = 0.3  # px: what half of the height is uncertain by, as silhouettes end between pixels
+UPRIGHT_SIGMA = 0.005  # m: heads are not as round as they are taken to be, nor is the ground as flat
+EDGE_PX = 0.2  # px: what half of the height is uncertain by, as silhouettes end between pixels
 START_DOUBT = 2.0  # times the deviations a track began with
 
 
