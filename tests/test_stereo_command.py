@@ -5,6 +5,7 @@ import json
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -109,6 +110,29 @@ def test_the_rivals_work_and_are_looser(scene, tmp_path, option):
     assert done.returncode == 0, done.stderr
     (track,) = tracks(tmp_path / "run")
     assert abs(track["summary"]["speed"] / MPH - 42.0) < 3.0
+
+
+def test_a_kitti_file_is_a_calibration_too(tmp_path):
+    made = straight_pass(33, mph=40.0)
+    rectified = replace(made, R=np.eye(3), T=np.array([-0.5, 0.0, 0.0]))
+    write_pass(rectified, tmp_path / "scene")
+    (tmp_path / "scene" / "calibration.yaml").unlink()
+    pair = {f"P{k}": rectified.K @ np.column_stack([np.eye(3), (k % 2) * rectified.T]) for k in range(4)}
+    lines = [f"{name}: " + " ".join(f"{value:.12e}" for value in P.ravel()) for name, P in pair.items()]
+    (tmp_path / "scene" / "calib.txt").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    options = ("--no-video", "--no-report", "--set", "observation.parts=7")
+    assert run(tmp_path / "scene", "--out", tmp_path / "run", *options).returncode == 0
+    (track,) = tracks(tmp_path / "run")
+    assert abs(track["summary"]["speed"] / MPH - 40.0) < 0.5
+
+
+def test_few_particles_give_a_looser_track_and_no_nonsense(scene, tmp_path):
+    options = ("--no-video", "--no-report", "--set", "smooth=false", "--set", "filter.particles=20")
+    done = run(scene, "--out", tmp_path / "run", *options, "--set", "filter.sigma_v=0.05")
+    assert done.returncode == 0, done.stderr
+    (track,) = tracks(tmp_path / "run")
+    assert all(state["speed_sigma"] > 0 for state in track["states"])
+    assert all(np.linalg.eigvalsh(np.array(state["covariance"])).min() > 0 for state in track["states"])
 
 
 def test_a_curved_path_is_followed(tmp_path):

@@ -14,6 +14,7 @@ from visfuse_cli.maths.planes import in_right, projected, triangulated
 from visfuse_cli.records import Array, Gaussian
 
 Z95 = 1.959963984540054
+NARROWEST = 1e-9  # m^2 and m^2/s^2 of a cloud of particles
 SHOWN = 0.2  # of its own height, or of the logarithm of it: what a moving thing changes in the picture
 ALIKE = 0.8  # median correlation
 USUAL_SIGMA, USUAL_RELIEF, USUAL_SPEED = 0.06, 0.1, 15.0
@@ -235,12 +236,14 @@ def _causal(target: Target, settled: Settled) -> Settled:
     cov = np.stack([belief.cov for _, _, belief, _ in kept])
     if target.free:
         order = free.KINEMATIC
-        belief = Gaussian(mean[:, order], cov[:, order][:, :, order] + 1e-9 * np.eye(6))
+        belief = Gaussian(mean[:, order], cov[:, order][:, :, order])
     else:
         order = [S, V, LATERAL, VERTICAL]
         place = mean[:, [S, LATERAL, VERTICAL]]
         still = np.zeros((len(mean), 2))
         belief, _ = _belief(target.way, place, mean[:, V], still, cov[:, order][:, :, order])
+    # A cloud of which one particle is left has no width of its own, but for rounding.
+    belief = Gaussian(belief.mean, belief.cov + NARROWEST * np.eye(6))
     speed = np.linalg.norm(belief.mean[:, 3:], axis=1)
     along = belief.mean[:, 3:] / np.maximum(speed, 1e-9)[:, None]
     sigma = np.sqrt(np.einsum("ta,tab,tb->t", along, belief.cov[:, 3:, 3:], along))

@@ -93,7 +93,7 @@ def measured(
 def take_over(target: Target, views: dict[str, list[Grey]]) -> None:
     """Let the reference follow what is seen, the first one staying in it. Zhu 2012, eq. 14."""
     settings = target.config.observation
-    fresh = patches.part_values(views["left"], target.looks[-1].quads["left"][None])[0]
+    fresh = patches.part_values(views["left"], target.looks[-1].quads["left"][None], settings.parts)[0]
     old, first = settings.epsilon, settings.first_share
     mixed = first * target.first + (1 - first) * (old * target.reference + (1 - old) * fresh)
     mixed = mixed - mixed.mean()

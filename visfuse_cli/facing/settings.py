@@ -31,6 +31,7 @@ class FilterSettings(Section):
 class ObservationSettings(Section):
     """How a pose is compared with the pictures."""
 
+    parts: int = Field(10, ge=4, le=16, description="into how many parts the patch is divided (Zhu 2012: 10)")
     lambda_d: float = Field(15.0, gt=0, le=1000, description="weight of the parts' distance (Zhu 2012: 15)")
     lambda_c: float = Field(20.0, gt=0, le=1000, description="weight of the correlation across views (Zhu 2012: 20)")
     epsilon: float = Field(0.3, ge=0, lt=1, description="weight of the old reference at an update (Zhu 2012: 0.3)")

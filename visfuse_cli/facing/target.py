@@ -72,7 +72,7 @@ def start(
         states = np.tile(state, (count, 1))
         states[:, S] += depth * place[2]
         states[:, V], states[:, SIZE] = speeds, depth
-    cells = patches.part_values(views["left"], left[None])[0]
+    cells = patches.part_values(views["left"], left[None], config.observation.parts)[0]
     target = Target(
         id=identity,
         rig=rig,
@@ -135,8 +135,8 @@ def predict(target: Target, t: float) -> None:
 def update(target: Target, views: dict[str, list[Grey]], at: tuple[int, float]) -> None:
     """Weigh the particles by both views, then align the patch from where they agree."""
     quads = quads_of(target, target.states)
-    values = {view: patches.part_values(views[view], quads[view]) for view in ("left", "right")}
     settings = target.config.observation
+    values = {view: patches.part_values(views[view], quads[view], settings.parts) for view in ("left", "right")}
     distance = sum((patches.part_distance(each, target.reference) for each in values.values()), np.zeros(1))
     across = patches.correlations(values["left"], values["right"])
     log_likelihood = -settings.lambda_d * distance + settings.lambda_c * across  # Zhu 2012, eqs. 13, 17-18, in logs

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from visfuse_cli.records import Array, Image
 
 Grey = NDArray[np.float32]
-PARTS = (5, 2)  # across and down
+PARTS = 10  # of a patch, in two rows
 CELLS = 4  # of each part, each way
 LEVELS = 5
 ROUNDS = 20
@@ -157,7 +157,7 @@ def follow(levels: list[Grey], quad: Array, sought: Template, stretch: float, go
     return replace(found, shift=found.shift + (moved - quad).mean(axis=0))
 
 
-def _spacing(quad: Array, count: tuple[int, int]) -> float:
+def _spacing(quad: Array, count: tuple[float, float]) -> float:
     wide, high = side(quad)
     return float(np.sqrt(wide / count[0] * high / count[1]))
 
@@ -262,15 +262,22 @@ def searched(level: Grey, quad: Array, sought: Template, reach: float, good: flo
     return np.asarray(quad + low + np.array(at) + (np.array(count) - 1) / 2 - quad.mean(axis=0))
 
 
-def part_values(levels: list[Grey], quads: Array) -> Grey:
-    """Cell values (P, cells) of the parts of quads (P, 4, 2): 10 parts of 4 x 4 cells, normalised in mean and contrast.
+def part_cells(parts: int) -> Array:
+    """Middles (16 parts, 2) over the unit square of the 4 x 4 cells of each part; an odd part goes to the upper row."""
+    rows = (parts - parts // 2, parts // 2)
+    upper, lower = (grid((across * CELLS, CELLS)) * [1.0, 0.5] for across in rows)
+    return np.concatenate([upper, lower + [0.0, 0.5]])
+
+
+def part_values(levels: list[Grey], quads: Array, parts: int = PARTS) -> Grey:
+    """Cell values (P, 16 parts) of the parts of quads (P, 4, 2), 4 x 4 cells each, normalised in mean and contrast.
 
     In orthonormal form the distance of a part's 16 Haar-like values is that of its 16 cells. Zhu 2012, eq. 13.
     """
-    count = (PARTS[0] * CELLS, PARTS[1] * CELLS)
+    count = (parts / 2 * CELLS, 2 * CELLS)
     some = [_spacing(quad, count) for quad in quads[:: len(quads) // 9 + 1]]
     level = _level(levels, float(np.median(some)))
-    unit = grid(count).astype(np.float32)
+    unit = part_cells(parts).astype(np.float32)
     out = np.empty((len(quads), len(unit)), np.float32)
     usable = np.nan_to_num(quads / 2**level, nan=-1e6).astype(np.float32)
     for k in range(0, len(quads), CHUNK):  # small buffers that stay in the cache, however many poses there are
