@@ -120,6 +120,18 @@ def test_a_run_of_a_moving_camera_has_a_page(tmp_path):
     assert _page(tmp_path / "report.html").rows == 1
 
 
+def test_depth_is_shown_beside_speed_where_the_frame_is_a_cameras_that_stands(tmp_path):
+    _moving_run(tmp_path)
+    assert "Depth over time" not in report.write([tmp_path]).read_text(encoding="utf-8")
+    tracks = tmp_path / "tracks.json"
+    tracks.write_text(tracks.read_text(encoding="utf-8").replace("left-camera-at-start", "left-camera"))
+    text = report.write([tmp_path]).read_text(encoding="utf-8")
+    assert text.count("Depth over time") == 1
+    shown = text[text.index("Depth over time") :]
+    assert "depth (m)" in shown[: shown.index("</svg>")]
+    assert 'class="track-1"' in shown[: shown.index("</svg>")]
+
+
 def test_what_is_too_large_to_embed_is_linked(run, tmp_path, monkeypatch):
     monkeypatch.setattr(report.page, "EMBEDDED_BYTES", 1000)
     text = report.write([run], tmp_path / "linked.html").read_text(encoding="utf-8")

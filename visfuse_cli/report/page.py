@@ -23,6 +23,7 @@ from visfuse_cli.report.folder import RunView, TrackView, read
 EMBEDDED_BYTES = 30_000_000  # of the videos of one run; what goes beyond is linked, beside the page
 MAP_HZ = 12.5  # of positions on the map
 NAME = "report.html"
+STEREO_FRAME = "left-camera"  # of positions of a pair that stands still: depth is their third number
 MEANING = {
     "consistent": "Measurements differ from what was predicted as much as the filter expects.",
     "cautious": "Measurements fit better than the filter expects; its intervals are rather too wide.",
@@ -84,6 +85,7 @@ def _section(number: int, run: RunView, page: Path) -> dict[str, Any]:
         "rejected": run.rejected,
         "histogram": plots.histogram(tables.speeds_kmh(run.rows), units) if run.rows else "",
         "speeds": plots.speeds(accepted, units),
+        "depths": plots.depths(accepted) if run.frame_of_reference == STEREO_FRAME else [],
         "models": plots.models(accepted),
         "consistency": _consistency(accepted),
         "calibration": _data_uri(run.calibration, "image/png") if run.calibration else "",

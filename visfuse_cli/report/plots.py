@@ -5,7 +5,7 @@ from __future__ import annotations
 import colorsys
 import io
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +25,8 @@ MOST_FIGURES = 24  # clips with a figure of their own
 MOST_POINTS = 400  # of one track
 INK = "#010203"  # stands for the colour of the page's text
 MODELS = {"drifting": "#7a8ca5", "cv": "#4c9f70", "ca": "#e08e45", "periodic": "#9a6fb0"}
+Curve = Callable[[TrackView], tuple[Array, Array]]  # values (T,) over time and how far their band reaches (T,)
+Highest = Callable[[Sequence[TrackView]], float]  # up to where the axis goes
 LAID_OUT: Any = {
     "svg.hashsalt": "visfuse",
     "svg.fonttype": "none",
@@ -73,24 +75,47 @@ def histogram(speeds: Array, units: Shown) -> str:
 
 def speeds(tracks: Sequence[TrackView], units: Shown) -> list[dict[str, Any]]:
     """Speed over time of each track with its 95 % band, a figure a clip: its name, SVG and time axis."""
+
+    def curve(track: TrackView) -> tuple[Array, Array]:
+        return track.speed * units.factor, Z95 * track.speed_sigma * units.factor
+
+    def highest(shown: Sequence[TrackView]) -> float:
+        return _highest(shown) * units.factor
+
+    return _over_time(tracks, curve, f"speed ({units.name})", highest)
+
+
+def depths(tracks: Sequence[TrackView]) -> list[dict[str, Any]]:
+    """Distance along the left camera's axis (m) over time of each track, a figure a clip as of `speeds`."""
+
+    def curve(track: TrackView) -> tuple[Array, Array]:
+        return track.position[:, 2], np.zeros(len(track.t))
+
+    def highest(shown: Sequence[TrackView]) -> float:
+        return 1.1 * max(float(track.position[:, 2].max()) for track in shown)
+
+    return _over_time(tracks, curve, "depth (m)", highest)
+
+
+def _over_time(tracks: Sequence[TrackView], curve: Curve, label: str, highest: Highest) -> list[dict[str, Any]]:
     clips = sorted({track.clip for track in tracks})
-    return [_speeds_of(clip, [t for t in tracks if t.clip == clip], units) for clip in clips[:MOST_FIGURES]]
+    return [_clip([t for t in tracks if t.clip == clip], curve, label, highest) for clip in clips[:MOST_FIGURES]]
 
 
-def _speeds_of(clip: str, tracks: list[TrackView], units: Shown) -> dict[str, Any]:
+def _clip(tracks: list[TrackView], curve: Curve, label: str, highest: Highest) -> dict[str, Any]:
+    """The figure of the tracks of one clip."""
     with matplotlib.rc_context(LAID_OUT):
         figure, axes = _axes(3.2)
         for track in tracks[:MOST_LINES]:
             each = max(1, len(track.t) // MOST_POINTS)
-            t, speed = track.t[::each], track.speed[::each] * units.factor
-            band, colour = Z95 * track.speed_sigma[::each] * units.factor, colour_of(track.id)
-            area = axes.fill_between(t, np.maximum(speed - band, 0), speed + band, color=colour, alpha=0.2, linewidth=0)
-            (line,) = axes.plot(t, speed, color=colour, linewidth=1.2)
-            name = axes.annotate(str(track.id), (t[-1], speed[-1]), fontsize=8, color=colour)
+            t, (value, band), colour = track.t[::each], (a[::each] for a in curve(track)), colour_of(track.id)
+            area = axes.fill_between(t, np.maximum(value - band, 0), value + band, color=colour, alpha=0.2, linewidth=0)
+            (line,) = axes.plot(t, value, color=colour, linewidth=1.2)
+            name = axes.annotate(str(track.id), (t[-1], value[-1]), fontsize=8, color=colour)
             for part in (area, line, name):
                 part.set_gid(f"track-{track.id}")
-        axes.set(xlabel="t (s)", ylabel=f"speed ({units.name})")
-        axes.set_ylim(0, _highest(tracks[:MOST_LINES]) * units.factor)
+        axes.set(xlabel="t (s)", ylabel=label)
+        axes.set_ylim(0, highest(tracks[:MOST_LINES]))
         axes.axvline(axes.get_xlim()[0], color="#d03030", linewidth=1).set_gid("cursor")
         axes.set_xlim(axes.get_xlim())
         figure.draw_without_rendering()
@@ -98,7 +123,7 @@ def _speeds_of(clip: str, tracks: list[TrackView], units: Shown) -> dict[str, An
         begin = float(axes.get_xlim()[0])
         more = f"the first {MOST_LINES} of {len(tracks)} tracks" if len(tracks) > MOST_LINES else ""
         return {
-            "clip": Path(clip).stem,
+            "clip": Path(tracks[0].clip).stem,
             "svg": _svg(figure),
             "begin": begin,
             "second": float(right - left),
