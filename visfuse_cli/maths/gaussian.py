@@ -60,7 +60,7 @@ def innovate(belief: Gaussian, residual: Array, H: Array, R: Array) -> tuple[Inn
         residual, H_P = np.broadcast_to(residual, shape), np.broadcast_to(H_P, (*shape, H_P.shape[-1]))
     solved = np.linalg.solve(S, np.concatenate([H_P, residual[..., None]], axis=-1))
     gain = transpose(solved[..., :-1])
-    nis = (residual * solved[..., -1]).sum(axis=-1)
+    nis = (residual[..., None, :] @ solved[..., -1:])[..., 0, 0]
     log_likelihood = -0.5 * nis - _log_normaliser(np.linalg.cholesky(S))
     return Innovation(residual, S, nis, log_likelihood), gain
 

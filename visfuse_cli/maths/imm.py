@@ -19,6 +19,7 @@ from visfuse_cli.maths.gaussian import symmetrise, times, transpose
 from visfuse_cli.records import Array, Gaussian, Innovation
 
 LEAST_LEFT, LEAST_KNOWN = 1e-12, 1e-9  # shares of a variance: rounding, below
+LEAST_LIKELY = float(np.finfo(float).tiny)  # a probability that can still be divided by
 Advance = Callable[[Array], tuple[Array, Array, Array]]  # x (..., r, N) -> x', F, Q, each model by its own motion
 
 
@@ -89,7 +90,7 @@ def mix(bank: Bank, log_p: Array, angles: tuple[int, ...] = ()) -> tuple[Gaussia
     `angles` are components of the state on the circle. Bradshaw 1997, sec. 5.
     """
     p, mu = np.exp(log_p), np.exp(bank.log_mu)
-    c = np.maximum(mu @ p, np.finfo(float).tiny)  # c_j = sum_i p_ij mu_i: Jia 2008, eq. 23
+    c = np.maximum(mu @ p, LEAST_LIKELY)  # c_j = sum_i p_ij mu_i: Jia 2008, eq. 23
     share = p.T * mu[..., None, :] / c[..., None]  # mu_i|j, j first: Jia 2008, eq. 24
     return _matched(bank.beliefs, share, angles), np.log(c)
 
@@ -113,7 +114,8 @@ def predict(bank: Bank, log_p: Array, advance: Advance, angles: tuple[int, ...] 
     mixed, ahead = mix(bank, log_p, angles)
     mean, F, Q = advance(mixed.mean)
     predicted = Gaussian(mean, gaussian.propagate(mixed.cov, F, Q))
-    F, Q = (part if part.shape == mixed.cov.shape else np.broadcast_to(part, mixed.cov.shape) for part in (F, Q))
+    if not F.shape == Q.shape == mixed.cov.shape:
+        F, Q = np.broadcast_to(F, mixed.cov.shape), np.broadcast_to(Q, mixed.cov.shape)
     return Step(mixed, F, Q, predicted, ahead, Bank(predicted, ahead))
 
 
@@ -140,11 +142,11 @@ def combined(bank: Bank, angles: tuple[int, ...] = ()) -> Gaussian:
     origin = beliefs.mean[..., :1, :]
     off = wrap_at(beliefs.mean - origin, angles)
     shift = mu @ off
-    off = off - shift
+    spread = (off - shift) * np.sqrt(transpose(mu))
     r, N = off.shape[-2:]
     cov = (mu @ beliefs.cov.reshape(*off.shape[:-2], r, N * N)).reshape(*off.shape[:-2], N, N)
-    cov += (transpose(off) * mu) @ off
-    return Gaussian(wrap_at(origin + shift, angles)[..., 0, :], symmetrise(cov))
+    cov += transpose(spread) @ spread  # symmetric to the last bit, as the beliefs are
+    return Gaussian(wrap_at(origin + shift, angles)[..., 0, :], cov)
 
 
 def smooth(steps: Sequence[Step], log_p: Array, angles: tuple[int, ...] = ()) -> list[Bank]:
