@@ -42,14 +42,12 @@ class Server:
     """
 
     def __init__(self, desk: Desk, port: int = 0) -> None:
-        token = secrets.token_urlsafe(24)
         try:
-            self._http = ThreadingHTTPServer((HOST, port), _handler(desk, token))
+            self._http = _Http(port, desk)
         except OSError as problem:
             raise OutputError(f"--port {port}: cannot be served on: {problem.strerror or problem}") from problem
-        self._http.daemon_threads = True
-        self.port = int(self._http.server_address[1])
-        self.address = f"http://{HOST}:{self.port}/{token}/"
+        self.port = self._http.server_port
+        self.address = f"http://{HOST}:{self.port}/{self._http.token}/"
         self._thread = threading.Thread(
             target=self._http.serve_forever, args=(0.05,), name="visfuse-picker", daemon=True
         )
@@ -71,99 +69,105 @@ class _Refusal(Exception):
         self.status = status
 
 
-def _handler(desk: Desk, token: str) -> type[BaseHTTPRequestHandler]:
-    """The request handler of one desk."""
+class _Http(ThreadingHTTPServer):
+    """A server that knows its desk, and the token without which it says nothing."""
 
-    class Handler(BaseHTTPRequestHandler):
-        timeout = SILENCE_S
-        server_version, sys_version = "visfuse", ""
+    daemon_threads = True
 
-        def do_GET(self) -> None:
-            self._answer(self._get)
+    def __init__(self, port: int, desk: Desk) -> None:
+        self.desk, self.token = desk, secrets.token_urlsafe(24)
+        super().__init__((HOST, port), _Handler)
 
-        def do_POST(self) -> None:
-            self._answer(self._post)
 
-        def _answer(self, work: Any) -> None:
-            try:
-                work(self._admitted())
-            except _Refusal as refusal:
-                self._send(refusal.status, str(refusal).encode(), "text/plain")
-            except VisfuseError as problem:
-                self._json({"reason": str(problem)}, HTTPStatus.UNPROCESSABLE_ENTITY)
-            except (BrokenPipeError, ConnectionResetError):
-                pass  # the page has gone
-            except Exception as problem:  # a defect must not cost what was picked so far
-                traceback.print_exc(file=sys.stderr)
-                self._json({"reason": f"internal error: {problem}"}, HTTPStatus.INTERNAL_SERVER_ERROR)
+class _Handler(BaseHTTPRequestHandler):
+    """One request."""
 
-        def _admitted(self) -> str:
-            """What is asked for, after the token; everything foreign is refused before it is looked at."""
-            port = self.server.server_address[1]  # type: ignore[index]
-            hosts = {f"{HOST}:{port}", f"localhost:{port}"}
-            if self.headers.get("Host") not in hosts:
-                raise _Refusal(HTTPStatus.FORBIDDEN)
-            origin = self.headers.get("Origin")
-            if origin is not None and origin not in {f"http://{host}" for host in hosts}:
-                raise _Refusal(HTTPStatus.FORBIDDEN)
-            key, separator, rest = urlsplit(self.path).path.removeprefix("/").partition("/")
-            if not (separator and secrets.compare_digest(key.encode(), token.encode())):
-                raise _Refusal(HTTPStatus.FORBIDDEN)
-            return rest
+    server: _Http
+    timeout = SILENCE_S
+    server_version, sys_version = "visfuse", ""
 
-        def _get(self, name: str) -> None:
-            if name in PAGE:
-                file, kind = PAGE[name]
-                self._send(HTTPStatus.OK, (resources.files(__package__) / "page" / file).read_bytes(), kind)
-            elif name == "about":
-                self._json(desk.about())
-            elif name == "frame":
-                when, picture = desk.frame(self._time())
-                self._send(HTTPStatus.OK, picture, "image/png", {"X-Time": f"{when!r}"})
-            else:
-                raise _Refusal(HTTPStatus.NOT_FOUND)
+    def do_GET(self) -> None:
+        self._answer(self._get)
 
-        def _post(self, name: str) -> None:
-            work = {"fit": desk.fit, "snap": desk.snap, "save": desk.save}.get(name)
-            if work is None:
-                raise _Refusal(HTTPStatus.NOT_FOUND)
-            self._json(work(self._body()))
-            if name == "save":
-                desk.done.set()  # after the answer, which is the last one
+    def do_POST(self) -> None:
+        self._answer(self._post)
 
-        def _time(self) -> float:
-            try:
-                return float(parse_qs(urlsplit(self.path).query)["t"][0])
-            except (KeyError, ValueError):
-                raise _Refusal(HTTPStatus.BAD_REQUEST) from None
+    def _answer(self, work: Any) -> None:
+        try:
+            work(self._admitted())
+        except _Refusal as refusal:
+            self._send(refusal.status, str(refusal).encode(), "text/plain")
+        except VisfuseError as problem:
+            self._json({"reason": str(problem)}, HTTPStatus.UNPROCESSABLE_ENTITY)
+        except (BrokenPipeError, ConnectionResetError):
+            pass  # the page has gone
+        except Exception as problem:  # a defect must not cost what was picked so far
+            traceback.print_exc(file=sys.stderr)
+            self._json({"reason": f"internal error: {problem}"}, HTTPStatus.INTERNAL_SERVER_ERROR)
 
-        def _body(self) -> dict[str, Any]:
-            if self.headers.get_content_type() != "application/json":  # no form of a foreign page sends that
-                raise _Refusal(HTTPStatus.UNSUPPORTED_MEDIA_TYPE)
-            length = self.headers.get("Content-Length", "")
-            if not length.isdecimal() or int(length) > LARGEST:
-                raise _Refusal(HTTPStatus.REQUEST_ENTITY_TOO_LARGE)
-            try:
-                body = json.loads(self.rfile.read(int(length)))
-            except (ValueError, RecursionError):
-                raise _Refusal(HTTPStatus.BAD_REQUEST) from None
-            if not isinstance(body, dict):
-                raise _Refusal(HTTPStatus.BAD_REQUEST)
-            return body
+    def _admitted(self) -> str:
+        """What is asked for, after the token; everything foreign is refused before it is looked at."""
+        port = self.server.server_port
+        hosts = {f"{HOST}:{port}", f"localhost:{port}"}
+        if self.headers.get("Host") not in hosts:
+            raise _Refusal(HTTPStatus.FORBIDDEN)
+        origin = self.headers.get("Origin")
+        if origin is not None and origin not in {f"http://{host}" for host in hosts}:
+            raise _Refusal(HTTPStatus.FORBIDDEN)
+        key, separator, rest = urlsplit(self.path).path.removeprefix("/").partition("/")
+        if not (separator and secrets.compare_digest(key.encode(), self.server.token.encode())):
+            raise _Refusal(HTTPStatus.FORBIDDEN)
+        return rest
 
-        def _json(self, value: dict[str, Any], status: HTTPStatus = HTTPStatus.OK) -> None:
-            self._send(status, json.dumps(value, allow_nan=False).encode(), "application/json")
+    def _get(self, name: str) -> None:
+        if name in PAGE:
+            file, kind = PAGE[name]
+            self._send(HTTPStatus.OK, (resources.files(__package__) / "page" / file).read_bytes(), kind)
+        elif name == "about":
+            self._json(self.server.desk.about())
+        elif name == "frame":
+            when, picture = self.server.desk.frame(self._time())
+            self._send(HTTPStatus.OK, picture, "image/png", {"X-Time": f"{when!r}"})
+        else:
+            raise _Refusal(HTTPStatus.NOT_FOUND)
 
-        def _send(self, status: HTTPStatus, body: bytes, kind: str, more: dict[str, str] | None = None) -> None:
-            self.send_response(status)
-            for name, value in (
-                {"Content-Type": kind, "Content-Length": str(len(body))} | HEADERS | (more or {})
-            ).items():
-                self.send_header(name, value)
-            self.end_headers()
-            self.wfile.write(body)
+    def _post(self, name: str) -> None:
+        work = {"fit": self.server.desk.fit, "snap": self.server.desk.snap, "save": self.server.desk.save}.get(name)
+        if work is None:
+            raise _Refusal(HTTPStatus.NOT_FOUND)
+        self._json(work(self._body()))
+        if name == "save":
+            self.server.desk.done.set()  # after the answer, which is the last one
 
-        def log_message(self, *args: Any) -> None:
-            """Say nothing: the terminal is for results."""
+    def _time(self) -> float:
+        try:
+            return float(parse_qs(urlsplit(self.path).query)["t"][0])
+        except (KeyError, ValueError):
+            raise _Refusal(HTTPStatus.BAD_REQUEST) from None
 
-    return Handler
+    def _body(self) -> dict[str, Any]:
+        if self.headers.get_content_type() != "application/json":  # no form of a foreign page sends that
+            raise _Refusal(HTTPStatus.UNSUPPORTED_MEDIA_TYPE)
+        length = self.headers.get("Content-Length", "")
+        if not length.isdecimal() or int(length) > LARGEST:
+            raise _Refusal(HTTPStatus.REQUEST_ENTITY_TOO_LARGE)
+        try:
+            body = json.loads(self.rfile.read(int(length)))
+        except (ValueError, RecursionError):
+            raise _Refusal(HTTPStatus.BAD_REQUEST) from None
+        if not isinstance(body, dict):
+            raise _Refusal(HTTPStatus.BAD_REQUEST)
+        return body
+
+    def _json(self, value: dict[str, Any], status: HTTPStatus = HTTPStatus.OK) -> None:
+        self._send(status, json.dumps(value, allow_nan=False).encode(), "application/json")
+
+    def _send(self, status: HTTPStatus, body: bytes, kind: str, more: dict[str, str] | None = None) -> None:
+        self.send_response(status)
+        for name, value in ({"Content-Type": kind, "Content-Length": str(len(body))} | HEADERS | (more or {})).items():
+            self.send_header(name, value)
+        self.end_headers()
+        self.wfile.write(body)
+
+    def log_message(self, *args: Any) -> None:
+        """Say nothing: the terminal is for results."""
