@@ -17,7 +17,9 @@ from visfuse_cli.records import Gaussian
 T, THETA = 0.04, (3,)  # s, the heading
 WHEELBASE = 2.5
 POSE_NOISE = np.diag([0.1, 0.1, np.deg2rad(2)]) ** 2
-CARS = ("ekf", "cuf", "fading", "fading-cuf")
+TOLD = 25  # frames that the noise first told counts for, where it adapts itself
+LEAST_PROCESS = np.array([1e-6, 1e-6, 1e-6, 1e-8, 1e-8])
+CARS = ("ekf", "fading-adapted", "cuf", "fading", "fading-cuf")
 
 
 def drives() -> dict[str, np.ndarray]:
@@ -53,7 +55,7 @@ def cars(runs: int) -> None:
     print(f"{'':<34}" + "".join(f"{kind:>18}" for kind in (*CARS, "bound")))
     root = np.sqrt(T)  # a and b held over a frame, as the paper's white noise
     tunings = {
-        "1 m/s^2, 0.1 rad/s a frame": (1.0 * root, 0.1 * root, 1.0),
+        "1 m/s^2, 0.1 rad/s a frame": (1.0 * root, 0.1 * root, 0.1),
         "1 m/s^2, 0.1 rad/s per root Hz": (1.0, 0.1, 1.0),
         "tuned for the manoeuvre": (3.0, 0.6, 3.0),
     }
@@ -77,7 +79,6 @@ def _bound(path: np.ndarray, sigma_a: float, sigma_steer: float) -> tuple[float,
 
 
 def _drive_errors(path: np.ndarray, kind: str, sigmas: tuple[float, float, float], runs: int) -> tuple[float, float]:
-    sigma_a, sigma_steer, sigma_jerk = sigmas
     size = 6 if "cuf" in kind else 5
     limit = fading.LIMIT if "fading" in kind else 1.0
     rng = np.random.default_rng(1)
@@ -85,20 +86,31 @@ def _drive_errors(path: np.ndarray, kind: str, sigmas: tuple[float, float, float
     P0 = np.diag([0.1, 0.1, 0.5, 0.05, 0.05, 0.5][:size]) ** 2
     mean = np.append(path[0], 0.0)[:size] + rng.normal(size=(runs, size)) @ np.sqrt(P0)
     belief, H = Gaussian(mean, np.broadcast_to(P0, (runs, size, size))), np.eye(size)[[0, 1, 3]]
-    memory, errors = None, []
+    R = np.broadcast_to(POSE_NOISE, (runs, 3, 3))
+    floors = (LEAST_PROCESS[:size], np.diag(POSE_NOISE))
+    memory, noise, errors = None, None, []
     for truth, seen in zip(path[1:], z[1:], strict=True):
-        if size == 6:
-            mean, F, Q = covariance_updating.advance(belief.mean, belief.cov, T, WHEELBASE, sigma_steer, sigma_jerk)
-        else:
-            mean, F = motion.bicycle(belief.mean, T, WHEELBASE)
-            Q = motion.bicycle_noise(belief.mean, T, WHEELBASE, sigma_a, sigma_steer)
+        mean, F, Q = _moved(belief, size, sigmas)
+        if kind == "fading-adapted":
+            noise = noise or fading.AdaptiveNoise(Q, R, TOLD)
+            Q, R = noise.Q, noise.R
         ahead = Gaussian(mean, gaussian.propagate(belief.cov, F, Q))
-        memory = memory or fading.start(ahead, H, POSE_NOISE)
-        residual = wrap_at(seen - mean[:, [0, 1, 3]], (2,))
-        step = fading.update(ahead, Q, residual, H, POSE_NOISE, memory, limit=limit)
-        belief = Gaussian(wrap_at(step.posterior.mean, THETA), step.posterior.cov)
-        memory = step.state
+        memory = memory or fading.start(ahead, H, R)
+        step = fading.update(ahead, Q, wrap_at(seen - mean[:, [0, 1, 3]], (2,)), H, R, memory, limit=limit)
+        belief, memory = Gaussian(wrap_at(step.posterior.mean, THETA), step.posterior.cov), step.state
+        if noise is not None:  # sec. 3.5
+            after = wrap_at(seen - belief.mean[:, [0, 1, 3]], (2,))
+            noise = fading.adapt_noise(noise, belief, after, wrap_at(belief.mean - mean, THETA), H, floors)
         errors.append(wrap_at(mean[:, :5] - truth, THETA))
     off = np.array(errors)[10:]
     peak = np.sqrt(np.mean(off[..., 3] ** 2, axis=1)).max()
     return float(np.rad2deg(peak)), float(np.sqrt(np.mean(np.sum(off[..., :2] ** 2, axis=-1))))
+
+
+def _moved(belief: Gaussian, size: int, sigmas: tuple[float, float, float]) -> tuple[np.ndarray, ...]:
+    """Mean, F and Q of the next frame, with (6) or without (5) the acceleration in the state."""
+    sigma_a, sigma_steer, sigma_jerk = sigmas
+    if size == 6:
+        return covariance_updating.advance(belief.mean, belief.cov, T, WHEELBASE, sigma_steer, sigma_jerk)
+    Q = motion.bicycle_noise(belief.mean, T, WHEELBASE, sigma_a, sigma_steer)
+    return *motion.bicycle(belief.mean, T, WHEELBASE), Q
