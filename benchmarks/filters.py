@@ -25,6 +25,8 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 from benchmarks import rival_filters
 from benchmarks.rival_filters import Step
 from visfuse_cli.maths import course, covariance_updating, fading, gaussian, imm, motion, particles, smoothing
+from visfuse_cli.moving.models import Models
+from visfuse_cli.moving.settings import FilterSettings
 from visfuse_cli.records import Gaussian
 
 DT = 0.04
@@ -36,11 +38,21 @@ F3, H3, R3 = motion.constant_velocity(DT, 3), np.eye(3, 6), 0.04 * np.eye(3)
 POSE = np.diag([0.1, 0.1, 0.03]) ** 2
 
 
+def _people() -> tuple[np.ndarray, np.ndarray]:
+    """F and Q (4, 12, 12) of Jia's four motions over DT, as `track-imm` has them."""
+    models = Models(FilterSettings())
+    step = models.predict(models.start(Gaussian(np.zeros(3), np.eye(3)), Gaussian(np.zeros(3), np.eye(3))), DT)
+    return step.F, step.Q
+
+
+PEOPLE = _people()
+
+
 def main() -> None:
     rivals: dict[str, dict[str, Step]] = {}
     constants = (F3, Qs, H3, R3)
     for package, make in (
-        ("FilterPy", lambda: rival_filters.filterpy(constants, STEPS, PARTICLES)),
+        ("FilterPy", lambda: rival_filters.filterpy(constants, PEOPLE, STEPS, PARTICLES)),
         ("Stone Soup", lambda: rival_filters.stone_soup(constants, DT, STEPS, PARTICLES)),
     ):
         try:
@@ -97,12 +109,21 @@ def kalman(tracks: int) -> Step:
 
 
 def interacting(tracks: int) -> Step:
-    bank, log_p = imm.start(beliefs(tracks, np.zeros(6)), 3), imm.transition(3, 0.95)
-    F = np.stack([F3] * 3)
+    return _interacting(tracks, np.stack([F3] * 3), Qs)
+
+
+def people(tracks: int) -> Step:
+    return _interacting(tracks, *PEOPLE)
+
+
+def _interacting(tracks: int, F: np.ndarray, Q: np.ndarray) -> Step:
+    models, size = F.shape[:2]
+    bank, log_p = imm.start(beliefs(tracks, np.zeros(size)), models), imm.transition(models, 0.95)
+    H = np.eye(3, size)
 
     def step() -> None:
-        ahead = imm.predict(bank, log_p, lambda x: (gaussian.times(F, x), F, Qs))
-        after, _ = imm.update(ahead, 0.1 - ahead.predicted.mean[..., :3], H3, R3)
+        ahead = imm.predict(bank, log_p, lambda x: (gaussian.times(F, x), F, Q))
+        after, _ = imm.update(ahead, 0.1 - ahead.predicted.mean[..., :3], H, R3)
         imm.combined(after.filtered)
 
     return step
@@ -181,6 +202,7 @@ def resampling(tracks: int) -> Step:
 OURS = {
     "Kalman, 6 states": kalman,
     "IMM, 3 models": interacting,
+    "IMM, 4 models": people,
     "EKF, constant speed": turning,
     "EKF, bicycle": bicycle,
     "fading": faded,

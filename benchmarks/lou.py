@@ -19,7 +19,7 @@ WHEELBASE = 2.5
 POSE_NOISE = np.diag([0.1, 0.1, np.deg2rad(2)]) ** 2
 TOLD = 25  # frames that the noise first told counts for, where it adapts itself
 LEAST_PROCESS = np.array([1e-6, 1e-6, 1e-6, 1e-8, 1e-8])
-CARS = ("ekf", "fading-adapted", "cuf", "fading", "fading-cuf")
+CARS = ("ekf", "cuf", "fading", "fading-adapted", "fading-cuf")
 
 
 def drives() -> dict[str, np.ndarray]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import datetime
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -14,35 +14,47 @@ Step = Callable[[], Any]
 Constants = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]  # F, Qs of three models, H, R
 
 
-def filterpy(constants: Constants, steps: int, particles: int) -> dict[str, Step]:
+def filterpy(
+    constants: Constants, people: tuple[np.ndarray, np.ndarray], steps: int, particles: int
+) -> dict[str, Step]:
     """Kalman, IMM, smoother over `steps`, and resampling by FilterPy; raises ImportError without it."""
     from filterpy.kalman import IMMEstimator, KalmanFilter
     from filterpy.monte_carlo import systematic_resample
 
-    F, Qs, H, R = constants
+    F, Qs, _, R = constants
 
-    def single(Q: np.ndarray) -> Any:
-        own = KalmanFilter(dim_x=6, dim_z=3)
-        own.F, own.H, own.R, own.Q = F, H, R, Q
-        own.x, own.P = np.zeros(6), 0.1 * np.eye(6)
+    def single(F: np.ndarray, Q: np.ndarray) -> Any:
+        size = len(F)
+        own = KalmanFilter(dim_x=size, dim_z=3)
+        own.F, own.H, own.R, own.Q = F, np.eye(3, size), R, Q
+        own.x, own.P = np.zeros(size), 0.1 * np.eye(size)
         return own
 
+    def interacting(Fs: Sequence[np.ndarray], Qs: np.ndarray) -> Step:
+        r = len(Qs)
+        bank = IMMEstimator(
+            [single(F, Q) for F, Q in zip(Fs, Qs, strict=True)], [1 / r] * r, np.exp(imm.transition(r, 0.95))
+        )
+
+        def step() -> None:
+            bank.predict()
+            bank.update(z)
+
+        return step
+
     z = np.full(3, 0.1)
-    alone, bank = single(Qs[1]), IMMEstimator([single(Q) for Q in Qs], [1 / 3] * 3, np.exp(imm.transition(3, 0.95)))
-    means, covs = single(Qs[1]).batch_filter(np.full((steps, 3), 0.1))[:2]
+    alone = single(F, Qs[1])
+    means, covs = single(F, Qs[1]).batch_filter(np.full((steps, 3), 0.1))[:2]
     weights = np.random.default_rng(0).dirichlet(np.ones(particles))
 
     def kalman() -> None:
         alone.predict()
         alone.update(z)
 
-    def interacting() -> None:
-        bank.predict()
-        bank.update(z)
-
     return {
         "Kalman, 6 states": kalman,
-        "IMM, 3 models": interacting,
+        "IMM, 3 models": interacting([F] * 3, Qs),
+        "IMM, 4 models": interacting(*people),
         "smoother, 50 steps": lambda: alone.rts_smoother(means, covs),
         "resampling": lambda: systematic_resample(weights),
     }

@@ -21,7 +21,9 @@ def transpose(matrix: NDArray[Any]) -> Array:
 
 def symmetrise(cov: Array) -> Array:
     """The symmetric part of covariances (..., n, n); the one place where rounding's asymmetry is removed."""
-    return (cov + transpose(cov)) * 0.5
+    twice = cov + transpose(cov)
+    twice *= 0.5
+    return twice
 
 
 def inverse(cov: Array) -> Array:
@@ -60,7 +62,7 @@ def innovate(belief: Gaussian, residual: Array, H: Array, R: Array) -> tuple[Inn
         residual, H_P = np.broadcast_to(residual, shape), np.broadcast_to(H_P, (*shape, H_P.shape[-1]))
     solved = np.linalg.solve(S, np.concatenate([H_P, residual[..., None]], axis=-1))
     gain = transpose(solved[..., :-1])
-    nis = (residual[..., None, :] @ solved[..., -1:])[..., 0, 0]
+    nis = np.add.reduce(residual * solved[..., -1], axis=-1)
     log_likelihood = -0.5 * nis - _log_normaliser(np.linalg.cholesky(S))
     return Innovation(residual, S, nis, log_likelihood), gain
 
@@ -114,7 +116,7 @@ def _density(residual: Array, cov: Array) -> tuple[Array, Array]:
 
 def _log_normaliser(L: NDArray[Any]) -> Array:
     """log of sqrt(det(2 pi S)) (...) from the Cholesky factors (..., n, n) of S."""
-    return np.log(L.diagonal(axis1=-2, axis2=-1)).sum(axis=-1) + L.shape[-1] * HALF_LOG_TAU
+    return np.asarray(np.add.reduce(np.log(L.diagonal(0, -2, -1)), axis=-1) + L.shape[-1] * HALF_LOG_TAU)
 
 
 def moment_match(means: Array, covs: Array, log_weights: Array, angles: tuple[int, ...] = ()) -> Gaussian:
