@@ -150,3 +150,41 @@ def test_jitter_keeps_the_moments_and_parts_what_was_drawn_twice():
 def test_a_cloud_in_which_no_particle_is_possible_is_refused():
     with pytest.raises(ValueError, match="no particle"):
         particles.normalised(np.array([[0.0, 1.0], [-np.inf, -np.inf]]))
+
+
+def test_a_measurement_far_sharper_than_the_cloud_matches_the_kalman_filter():
+    rng = np.random.default_rng(5)
+    H, R = np.array([[1.0, 0.5, 0.0], [0.2, 0.0, 1.0]]), np.diag([1e-3, 2e-3]) ** 2
+    prior = Gaussian(np.array([1.0, -2.0, 0.5]), np.diag([2.0, 3.0, 1.0]) ** 2)
+    z = np.array([1.7, -0.4])
+    exact, innovation = gaussian.update(prior, z - H @ prior.mean, H, R)
+
+    def log_likelihood(states):
+        return gaussian.log_density(z - states @ H.T, R)
+
+    shift = 0.3 * np.linalg.cholesky(exact.cov) @ np.ones(3)
+    off = Gaussian(exact.mean + shift, 1.3 * exact.cov)  # a proposal need not be right
+    states, log_weights, evidence = particles.imported(prior, off, log_likelihood, 2000, rng)
+    found = particles.moments(states, log_weights)
+    assert particles.effective_number(log_weights) > 1000
+    np.testing.assert_allclose(found.mean, exact.mean, atol=4 * np.sqrt(np.diag(exact.cov).max() / 1000))
+    np.testing.assert_allclose(np.diag(found.cov), np.diag(exact.cov), rtol=0.15)
+    assert abs(evidence - innovation.log_likelihood) < 0.1
+
+
+def test_drawn_states_have_exactly_the_beliefs_moments():
+    belief = Gaussian(np.array([3.0, -1.0]), np.array([[4.0, 1.9], [1.9, 1.0]]))
+    states = particles.drawn(belief, 12, np.random.default_rng(0))
+    np.testing.assert_allclose(states.mean(axis=0), belief.mean, atol=1e-12)
+    np.testing.assert_allclose(np.cov(states.T, bias=True), belief.cov, atol=1e-12)
+
+
+@pytest.mark.parametrize("sharpness", [1e-3, 3.0, 1e4])
+def test_as_much_of_a_likelihood_is_borne_as_leaves_the_particles_effective(sharpness):
+    rng = np.random.default_rng(1)
+    log_weights = np.full(300, -np.log(300))
+    said = -sharpness * rng.normal(size=300) ** 2
+    share = particles.bearable(log_weights, said, 0.5)
+    left = particles.effective_number(particles.normalised(log_weights + share * said))
+    assert left >= 149
+    assert share == 1.0 or left < 160

@@ -49,6 +49,8 @@ class Settled:
     relief: float
     way: Way
     ended_by: str
+    nis: list[float]  # of the filter that ran forward: normalised innovations squared of `nis_dof` numbers each
+    nis_dof: int = 5
 
 
 def conclude(target: Target) -> Settled | None:
@@ -173,6 +175,7 @@ def _settled(target: Target, t: Array, adjusted: Adjusted) -> Settled:
         relief=adjusted.relief,
         way=target.way,
         ended_by=target.ended_by,
+        nis=target.nis,
     )
 
 

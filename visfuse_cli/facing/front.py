@@ -96,6 +96,7 @@ class Target:
     last_seen: float = 0.0
     pieces: Pieces = field(default_factory=Pieces)
     looks: list[Looked] = field(default_factory=list)
+    nis: list[float] = field(default_factory=list)  # normalised innovation squared of each look but the first
     causal: list[tuple[int, float, Gaussian, bool]] = field(default_factory=list)
     clouds: dict[int, Array] = field(default_factory=dict)  # by frame: where some of the particles stood (n, 3) m
     ended_by: str = ""

@@ -6,12 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from visfuse_cli.facing.front import (
-    Looked,
-    Target,
-    corners,
-    left_quad,
-)
+from visfuse_cli.facing import cloud
+from visfuse_cli.facing.front import Looked, Target, corners, left_quad
 from visfuse_cli.maths.planes import in_right, projected, triangulated
 from visfuse_cli.records import Array
 from visfuse_cli.vision import patches
@@ -84,8 +80,10 @@ def measured(
     R[3:, 3:] = R[:2, :2] + TRUST * across.cov[:2, :2] + FLOOR_PX**2 * np.eye(2)
     R[3:, :3], R[:3, 3:] = R[:2, :3], R[:3, :2]
     seen, quads = target.pieces.look(views, {"left": left, "right": right})
-    left, right = quads["left"], quads["right"]
-    z = np.concatenate([left.mean(axis=0), [patches.log_height(left)], right.mean(axis=0)])
+    # The pieces carry errors of their first sight on; what is beside the left patch now was searched afresh.
+    middle = quads["left"].mean(axis=0)
+    across = right.mean(axis=0) + middle - left.mean(axis=0)
+    z = np.concatenate([middle, [patches.log_height(quads["left"])], across])
     target.looks.append(Looked(*at, z, R, quads, found.correlation, seen))
     return True
 
@@ -121,3 +119,4 @@ def settle_on(target: Target, views: dict[str, list[Grey]], region: Array, dt: f
         target.looks[-1] = replace(look, quads=quads)
         target.sought = patches.template(views["left"], quads["left"])
         target.pieces.moved(look.quads, quads)
+        cloud.shift(target, share * shift, float(np.log(stretch)))

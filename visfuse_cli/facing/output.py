@@ -32,6 +32,8 @@ def track_record(path: Settled, rig: StereoRig, latency: float) -> dict[str, Any
             "speed": path.mean_speed,
             "speed_ci95": [low, path.mean_speed + Z95 * path.mean_sigma],
             "noise": path.noise,
+            "nis_mean": float(np.mean(path.nis)) if path.nis else 0.0,
+            "nis_dof": path.nis_dof,
             "relief": path.relief,
             "sigma_v": path.sigma_v,
             "path": {"from": path.way.frame(np.array(0.0))[0].tolist(), "length": path.way.length},

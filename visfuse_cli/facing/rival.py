@@ -27,21 +27,22 @@ def follow_triangulated(target: Target) -> Settled | None:
     places, noise = _places(target)
     sigma_v = target.config.filter.sigma_v or USUAL_SIGMA
     belief = Gaussian(np.concatenate([places[0], np.zeros(3)]), LOOSE)
-    filtered, predicted, transitions = [], [], []
+    filtered, predicted, transitions, nis = [], [], [], []
     for k in range(len(t)):
         dt = float(t[k] - t[k - 1]) if k else 0.0
         F = np.eye(6)
         F[:3, 3:] = dt * np.eye(3)
         Q = 5 * sigma_v**2 * np.kron(np.array([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]]), np.eye(3))
         ahead = gaussian.predict(belief, F, Q + 1e-12 * np.eye(6)) if k else belief
-        belief, _ = gaussian.update(ahead, places[k] - ahead.mean[:3], H, noise[k])
+        belief, innovation = gaussian.update(ahead, places[k] - ahead.mean[:3], H, noise[k])
+        nis.append(float(innovation.nis))
         filtered.append(belief)
         predicted.append(ahead)
         transitions.append(F)
     after = _stacked(filtered)
     if target.config.smooth:
         after = rauch_tung_striebel(after, _stacked(predicted), np.stack(transitions))
-    return _settled(target, t, after, sigma_v)
+    return _settled(target, t, after, sigma_v, nis[1:])
 
 
 def _places(target: Target) -> tuple[Array, Array]:
@@ -57,7 +58,7 @@ def _stacked(beliefs: list[Gaussian]) -> Gaussian:
     return Gaussian(np.stack([each.mean for each in beliefs]), np.stack([each.cov for each in beliefs]))
 
 
-def _settled(target: Target, t: Array, belief: Gaussian, sigma_v: float) -> Settled:
+def _settled(target: Target, t: Array, belief: Gaussian, sigma_v: float, nis: list[float]) -> Settled:
     velocity = belief.mean[:, 3:]
     speed = np.linalg.norm(velocity, axis=1)
     along = velocity / np.maximum(speed, 1e-9)[:, None]
@@ -81,4 +82,6 @@ def _settled(target: Target, t: Array, belief: Gaussian, sigma_v: float) -> Sett
         relief=0.0,
         way=Way(np.stack([places[0], places[-1] + [0, 0, 1e-3]])),
         ended_by=target.ended_by,
+        nis=nis,
+        nis_dof=3,
     )

@@ -10,9 +10,12 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from visfuse_cli.maths.gaussian import symmetrise, transpose
+from visfuse_cli.maths.gaussian import log_density, symmetrise, transpose
 from visfuse_cli.records import Array, Gaussian
 
+LogLikelihood = Callable[[Array], Array]  # log p(z | x) of states (P, n): (P,)
+HALVINGS = 24  # of a likelihood's share
+WIDER = 1.2  # than the proposal's covariance, that states are drawn from
 # log p(x_k+1 | x_k) of states now (P, n) and the next ones (M, n), k the instant now: (P, M)
 LogTransition = Callable[[Array, Array, int], Array]
 
@@ -77,6 +80,42 @@ def renewed(
     if jitter:
         drawn = np.where(low[..., None, None], regularised(drawn, after, rng, jitter), drawn)
     return drawn, after
+
+
+def bearable(log_weights: Array, log_likelihood: Array, least: float) -> float:
+    """The largest share of a log likelihood (P,), at most 1, that leaves one cloud an effective number of `least` P."""
+    low, high, middle = 0.0, 1.0, 1.0
+    for _ in range(HALVINGS):
+        enough = effective_number(normalised(log_weights + middle * log_likelihood)) >= least * len(log_weights)
+        low, high = (middle, high) if enough else (low, middle)
+        if low == high:
+            break
+        middle = (low + high) / 2
+    return low
+
+
+def drawn(belief: Gaussian, count: int, rng: np.random.Generator) -> Array:
+    """States (count, n), more than n, whose mean and covariance are the belief's to rounding."""
+    kick = rng.normal(size=(count, len(belief.mean)))
+    kick -= kick.mean(axis=0)
+    white = np.linalg.solve(np.linalg.cholesky(kick.T @ kick / count), kick.T)
+    return np.asarray(belief.mean + (np.linalg.cholesky(belief.cov) @ white).T)
+
+
+def imported(
+    prior: Gaussian, proposal: Gaussian, log_likelihood: LogLikelihood, count: int, rng: np.random.Generator
+) -> tuple[Array, Array, float]:
+    """A cloud (count, n) of the posterior, its log weights, and the log evidence: drawn from `proposal`, weighed.
+
+    For a measurement far sharper than the prior, of which hardly a particle would be left otherwise: the Gaussian
+    particle filter of Kotecha & Djuric 2003.
+    """
+    wide = WIDER * proposal.cov
+    states = drawn(Gaussian(proposal.mean, wide), count, rng)
+    weights = log_likelihood(states) + log_density(states - prior.mean, prior.cov)
+    weights = weights - log_density(states - proposal.mean, wide)
+    log_weights = normalised(weights)
+    return states, log_weights, float(np.max(weights - log_weights) - np.log(count))
 
 
 def backward_draws(

@@ -9,7 +9,7 @@ import numpy as np
 
 from visfuse_cli.commands.track_stereo_pf.scene import VIEWS, Scene, pairs
 from visfuse_cli.errors import InputError
-from visfuse_cli.facing import front, target
+from visfuse_cli.facing import cloud, front, target
 from visfuse_cli.facing.find import Finder, Found
 from visfuse_cli.facing.front import Target
 from visfuse_cli.facing.look import settle_on
@@ -69,7 +69,7 @@ def follow(
             first = False
         with run_.stage("filter"):
             for each in followed:
-                target.predict(each, pair.t)
+                cloud.predict(each, pair.t)
                 target.update(each, views, at)
         ended = [each for each in followed if _over(each, scene, pair.t)]
         followed = [each for each in followed if each not in ended]
