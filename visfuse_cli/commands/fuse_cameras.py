@@ -35,7 +35,6 @@ from visfuse_cli.fusing.output import track_record
 from visfuse_cli.fusing.person import Person
 from visfuse_cli.fusing.settings import FuseConfig
 from visfuse_cli.fusing.tracker import Tracker
-from visfuse_cli.fusing.visibility import visibility
 from visfuse_cli.maths import multiview
 from visfuse_cli.pipeline import Run
 from visfuse_cli.records import Array, RunRequest, RunResult, TimeAudit, View
@@ -183,7 +182,7 @@ def _follow(
             sightings = eyes.look(tracker)
         with run_.stage("fuse"):
             tracker.update(instant.index, sightings)
-            inside, clear = visibility(tracker.beliefs, eyes.sizes, eyes.P, tracker.config)
+            inside, clear = eyes.visible(tracker.beliefs)
             tracker.miss(clear & eyes.open, sightings)
             tracker.watch(clear & eyes.open)
             ended = tracker.end(instant.t, np.count_nonzero(inside, axis=1))

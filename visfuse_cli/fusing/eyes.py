@@ -13,8 +13,9 @@ from visfuse_cli.fusing.box_watch import BoxWatch
 from visfuse_cli.fusing.picture_watch import Camera, PictureWatch
 from visfuse_cli.fusing.settings import FuseConfig
 from visfuse_cli.fusing.tracker import Newcomer, Tracker
+from visfuse_cli.fusing.visibility import visibility
 from visfuse_cli.maths import multiview
-from visfuse_cli.records import Array, Frame, FrameSet, Image, Sighting, View
+from visfuse_cli.records import Array, Frame, FrameSet, Gaussian, Image, Sighting, View
 from visfuse_cli.threads import thread_cap
 from visfuse_cli.vision.empty import empty_picture
 from visfuse_cli.vision.straighten import Straight
@@ -53,6 +54,9 @@ class Eyes(Protocol):
     def newcomers(self, tracker: Tracker) -> list[Newcomer]:
         """Who is seen and not followed yet."""
 
+    def visible(self, beliefs: Gaussian) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+        """Which pictures hold each person's middle (T, C), and which give a clear sight of it (T, C)."""
+
     def learn(self, t: float, tracker: Tracker) -> None:
         """Adapt to the latest set."""
 
@@ -65,7 +69,7 @@ class BoxEyes:
         self.sizes = np.array([view.size for view in views], dtype=float)
         self.zoom = np.ones(len(views))
         self.open = np.zeros(len(views), dtype=bool)
-        self._names = [view.name for view in views]
+        self._names, self._config = [view.name for view in views], config
         self._boxes = boxes
         self._watch = BoxWatch(views, self.P, config)
         self._now: dict[int, Array] = {}
@@ -92,6 +96,10 @@ class BoxEyes:
         """Who is seen and not followed yet."""
         return self._watch.newcomers(tracker)
 
+    def visible(self, beliefs: Gaussian) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+        """Which pictures hold each person's middle (T, C), and which give a clear sight of it (T, C)."""
+        return visibility(beliefs, self.sizes, self.P, self._config)
+
     def learn(self, t: float, tracker: Tracker) -> None:
         """Boxes from outside need no background."""
 
@@ -107,10 +115,11 @@ class PictureEyes:
         self.P = np.stack(
             [each.K @ np.column_stack([view.R, view.t]) for each, view in zip(straight, views, strict=True)]
         )
+        self._outside = [each.outside for each in straight]
         self.sizes = np.array([each.size for each in straight], dtype=float)
-        self.zoom = np.array([view.lens.K[0, 0] / each.K[0, 0] for each, view in zip(straight, views, strict=True)])
+        self.zoom = np.array([view.size[0] / each.small[0] for each, view in zip(straight, views, strict=True)])
         self.open = np.zeros(len(views), dtype=bool)
-        self._names = [view.name for view in views]
+        self._names, self._config = [view.name for view in views], config
         self._watch = PictureWatch(self._cameras, self.P, config)
         self._dt: dict[int, float] = {}
         self._pool = ThreadPoolExecutor(min(THREADS, thread_cap() or THREADS))
@@ -135,6 +144,10 @@ class PictureEyes:
     def newcomers(self, tracker: Tracker) -> list[Newcomer]:
         """Who is seen and not followed yet."""
         return self._watch.newcomers(tracker)
+
+    def visible(self, beliefs: Gaussian) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+        """Which pictures hold each person's middle (T, C), and which give a clear sight of it (T, C)."""
+        return visibility(beliefs, self.sizes, self.P, self._config, self._outside)
 
     def learn(self, t: float, tracker: Tracker) -> None:
         """Let the backgrounds adapt where nobody is."""

@@ -11,9 +11,11 @@ from visfuse_cli.fusing.person import Person
 from visfuse_cli.fusing.settings import FuseConfig
 from visfuse_cli.fusing.sighting import expect, learn_body, tracked_point
 from visfuse_cli.fusing.tracker import PRIOR_LOOKS, Newcomer, Tracker, beginning
+from visfuse_cli.fusing.visibility import standing
 from visfuse_cli.records import Array, Gaussian, Image, Sighting
 from visfuse_cli.vision import silhouettes
 from visfuse_cli.vision.background import Background
+from visfuse_cli.vision.backing import backed
 from visfuse_cli.vision.ground_shadows import GroundShadows
 from visfuse_cli.vision.matching import agree
 from visfuse_cli.vision.occupancy import Occupancy
@@ -81,7 +83,8 @@ class PictureWatch:
         """Sightings of everybody followed, by the cameras in `dt` (s), whose pictures were looked at."""
         self._dt = dt
         expected = self._expected(tracker.people)
-        return [self._sightings(expected, k, person.body) for k, person in enumerate(tracker.people)]
+        there = self._backed(tracker.beliefs, [person.body for person in tracker.people])
+        return [self._sightings(expected, there[k], k, person.body) for k, person in enumerate(tracker.people)]
 
     def newcomers(self, tracker: Tracker) -> list[Newcomer]:
         """People in what moves and belongs to nobody who is followed."""
@@ -121,21 +124,28 @@ class PictureWatch:
             self._config,
         )
 
-    def _sightings(self, expected: list[Expected], who: int, body: Body) -> dict[int, Sighting]:
+    def _backed(self, beliefs: Gaussian, bodies: list[Body]) -> list[dict[int, Array]]:
+        """Where in the pictures people with these beliefs (T, 6) and bodies (T) can be: boxes (n, 4) px by camera."""
+        foot = standing(beliefs, np.array([body.ends.height for body in bodies]), self._config)
+        masks = {camera: self._cameras[camera].mask for camera in self._dt}
+        outside = {camera: self._cameras[camera].straight.outside for camera in self._dt}
+        return backed(self._P, masks, outside, foot)
+
+    def _sightings(self, expected: list[Expected], room: dict[int, Array], who: int, body: Body) -> dict[int, Sighting]:
         """What each camera sees of one of the expected people, whose lengths are learnt."""
         found, assumed = {}, body.ends.mean
         for camera, dt in self._dt.items():
             there = expected[camera]
             if not (np.isfinite(there.box[who]).all() and there.depth[who] > 0):
                 continue
-            seen = silhouettes.sides(self._cameras[camera].mask, there, who)
+            eye = self._cameras[camera]
+            seen = silhouettes.sides(eye.mask, eye.straight.outside, there, who, room.get(camera))
             if seen is None or seen.share < LEAST_SHARE:
                 continue
             measured = tracked_point(there, who, seen, body, self._config)
             if measured is not None:
                 z, R, lever = measured
-                shown = self._cameras[camera].straight.shown(seen.box[None])[0]
-                found[camera] = Sighting(z, R, shown, dt, lever, float(lever @ assumed))
+                found[camera] = Sighting(z, R, eye.straight.shown(seen.rim), dt, lever, float(lever @ assumed))
                 learn_body(body, assumed, there, who, seen)
         return found
 
@@ -156,7 +166,8 @@ class PictureWatch:
                 np.array([0] * len(people) + [1], dtype=np.intp),
                 self._config,
             )
-            sightings = self._sightings(expected, len(people), body)
+            there = self._backed(_stacked([belief]), [body])[0]
+            sightings = self._sightings(expected, there, len(people), body)
             cameras = sorted(sightings)
             if len(cameras) < 2:
                 return None

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from visfuse_cli.records import Array, Image
 from visfuse_cli.vision.background import FOREGROUND
+from visfuse_cli.vision.backing import covered
 
 SIDEWAYS_M, UPWARDS_M = 0.3, 0.25  # how far around the expected box a person's pixels are looked for
 LEAST_ROW, LEAST_COLUMN = 0.10, 0.05  # share of the width, of the height, that a side's row or column holds
@@ -48,13 +49,16 @@ class Expected:
 
 @dataclass(frozen=True, slots=True)
 class Sides:
-    """What was seen of one person: box [u0, v0, u1, v1] (4,) px, whether its top and bottom are its own, share seen.
+    """What was seen of one person: box [u0, v0, u1, v1] (4,) px, points (n, 2) px of its rim, and the share seen.
+
+    `top` and `bottom` say whether these ends of the box are its own.
 
     Across, row by row from the expected axis, the median over rows of which a side is the person's own: `middle` px by
     which it is off, `left` and `right` px that it reaches; NaN where too few rows tell.
     """
 
     box: Array
+    rim: Array
     top: bool
     bottom: bool
     share: float
@@ -70,8 +74,12 @@ def moving(labels: Image) -> Image:
     return np.asarray(cv2.min(mask, 1), np.uint8)
 
 
-def sides(mask: Image, expected: Expected, who: int) -> Sides | None:
-    """The sides of one of the expected people in a mask (H, W) of what moves; None where too little is seen."""
+def sides(mask: Image, outside: Image, expected: Expected, who: int, backed: Array | None) -> Sides | None:
+    """The sides of one of the expected people in a mask (H, W) of what moves; None where too little is seen.
+
+    `outside` (H, W) is where the picture does not reach. What lies in none of the boxes `backed` (n, 4) px, if there
+    are any, is not the person's.
+    """
     high, wide = mask.shape
     scale, box = expected.scale[who], expected.box[who]
     around, above = SIDEWAYS_M * scale + expected.reach[who], UPWARDS_M * scale + expected.reach[who]
@@ -79,8 +87,10 @@ def sides(mask: Image, expected: Expected, who: int) -> Sides | None:
     right, bottom = min(int(box[2] + around) + 1, wide), min(int(box[3] + above) + 1, high)
     if right - left < 3 or bottom - top < 5:
         return None
-    part = mask[top:bottom, left:right]
-    own = part.astype(bool) & _owned(expected, who, (left, top, right, bottom))
+    part, window = mask[top:bottom, left:right], (left, top, right, bottom)
+    own = part.astype(bool) & _owned(expected, who, window)
+    if backed is not None:
+        own &= covered(backed, window)
     tall, broad = box[3] - box[1], box[2] - box[0]
     columns, rows = own.sum(axis=0), own.sum(axis=1)
     across = np.flatnonzero(columns >= max(2.0, LEAST_COLUMN * tall))
@@ -90,14 +100,23 @@ def sides(mask: Image, expected: Expected, who: int) -> Sides | None:
     u0, u1, v0, v1 = int(across[0]), int(across[-1]) + 1, int(down[0]), int(down[-1]) + 1
     # A pixel reaches half of one to each side, and at a border it is new as soon as a part of it is.
     found = np.array([left + u0, top + v0, left + u1, top + v1]) - 0.5 + PARTLY_PX * np.array([1, 1, -1, -1])
-    other = part.astype(bool) & ~own
+    other = (part.astype(bool) & ~own) | outside[top:bottom, left:right].astype(bool)
     return Sides(
         found,
+        _rim(own[down][:, u0:u1], down) + [left + u0, top],
         bool(top + v0 > 1 and (v0 > 0 or top == 0) and not _touched(own, other, v0, -1)),
         bool(top + v1 < high - 1 and v1 < bottom - top and not _touched(own, other, v1, 1)),
         float(own.sum()) / max(0.55 * tall * broad, 1.0),
         *_across(own, other, down, expected.axis[who] - [left, top], left == 0),
     )
+
+
+def _rim(own: NDArray[np.bool_], rows: NDArray[np.intp]) -> Array:
+    """The first and the last pixel, and a half, of each of the rows (n,) in which somebody is, own (n, w)."""
+    there = own.any(axis=1)
+    first, last = own.argmax(axis=1)[there] - 0.5, own.shape[1] - 0.5 - own[:, ::-1].argmax(axis=1)[there]
+    ends = [np.column_stack([u, rows[there] + half]) for u in (first, last) for half in (-0.5, 0.5)]
+    return np.concatenate(ends)
 
 
 def _across(

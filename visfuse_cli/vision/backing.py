@@ -1,0 +1,81 @@
+"""What several pictures show alike: where in each one somebody can be, by what the other cameras see there."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from visfuse_cli.maths import multiview
+from visfuse_cli.records import Array, Image
+
+STEP_M = 0.12  # side of the cells that the room about somebody is divided into
+RADIUS_M, LOW_M, HIGH_M = 0.96, -0.12, 2.4  # of that room, about and above where somebody stands
+CORNER = 0.7  # cells' sides from a cell's middle to its corners, as most pictures see them
+AGAINST = 2  # cameras at least that must see nothing in a cell to call it empty: one may have its sight blocked
+
+
+def _room() -> Array:
+    line = np.arange(-RADIUS_M, RADIUS_M + STEP_M / 2, STEP_M)
+    up = np.arange(LOW_M, HIGH_M, STEP_M) + STEP_M / 2
+    cells = np.stack(np.meshgrid(line, line, up, indexing="ij"), axis=-1).reshape(-1, 3)
+    return cells[np.hypot(cells[:, 0], cells[:, 1]) <= RADIUS_M]
+
+
+ROOM = _room()
+
+
+def backed(P: Array, masks: Mapping[int, Image], outside: Mapping[int, Image], feet: Array) -> list[dict[int, Array]]:
+    """Boxes [u0, v0, u1, v1] (n, 4) px that cover, in each camera's picture, where people at feet (T, 3) m can be.
+
+    masks (H, W) by camera of P (C, 3, 4) hold what moves, `outside` what a picture does not reach. A cell of the room
+    counts for a picture unless most of the other cameras that hold it see nothing there. Where fewer than three cameras
+    look, and where no cell is left, a picture is not limited: its camera is missing.
+    """
+    if len(masks) <= AGAINST or not len(feet):
+        return [{} for _ in feet]
+    cells = feet[:, None] + ROOM
+    looks = [_look(P[camera], mask, outside[camera], cells) for camera, mask in masks.items()]
+    holders, seers = (np.sum([look[k] for look in looks], axis=0) for k in (1, 2))
+    found: list[dict[int, Array]] = [{} for _ in feet]
+    for camera, (box, held, there) in zip(masks, looks, strict=True):
+        others, against = holders - held, holders - held - (seers - there)
+        good = there & ~((against >= AGAINST) & (2 * against > others))
+        for who in np.flatnonzero(good.any(axis=1)):
+            found[who][camera] = box[who, good[who]]
+    return found
+
+
+def _look(
+    P: Array, mask: Image, outside: Image, cells: Array
+) -> tuple[NDArray[np.intp], NDArray[np.bool_], NDArray[np.bool_]]:
+    """The boxes (T, N, 4) px that cells (T, N, 3) fill in one picture, whether it holds them, and what moves there."""
+    size = np.array(mask.shape[::-1])
+    pixels, _ = multiview.project(P, cells)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        half = CORNER * STEP_M * np.linalg.norm(P[0, :3]) / multiview.depths(P, cells)
+        held = np.isfinite(pixels).all(axis=-1) & np.all((pixels > 0) & (pixels < size - 1), axis=-1)
+    middle, half = np.where(held[..., None], pixels, 0), np.where(held, half, 0)[..., None]
+    u, v = np.moveaxis(middle.astype(np.intp), -1, 0)
+    held &= outside[v, u] == 0
+    low, high = np.clip(np.floor(middle - half), 0, size), np.clip(np.ceil(middle + half) + 1, 0, size)
+    box = np.concatenate([low, high], axis=-1).astype(np.intp)
+    u0, v0, u1, v1 = np.moveaxis(box, -1, 0)
+    summed = cv2.integral(mask)
+    count = summed[v1, u1] - summed[v0, u1] - summed[v1, u0] + summed[v0, u0]
+    return box, held, held & (count > 0)
+
+
+def covered(boxes: Array, window: tuple[int, int, int, int]) -> NDArray[np.bool_]:
+    """Which pixels of a window [left, top, right, bottom] lie in one of the boxes (n, 4), the last row left out."""
+    left, top, right, bottom = window
+    low, high = np.array([left, top]), np.array([right, bottom])
+    u0, v0 = (np.clip(boxes[:, :2], low, high) - low).T
+    u1, v1 = (np.clip(boxes[:, 2:], low, high) - low).T
+    wide, tall = right - left + 1, bottom - top + 1
+    corners = np.concatenate([v0 * wide + u0, v1 * wide + u1, v0 * wide + u1, v1 * wide + u0])
+    sign = np.repeat([1.0, 1.0, -1.0, -1.0], len(boxes))
+    layers = np.bincount(corners, sign, wide * tall).reshape(tall, wide)
+    return np.asarray(layers.cumsum(axis=0).cumsum(axis=1)[:-1, :-1] > 0.5)
