@@ -65,6 +65,7 @@ def frames(yard: Yard, name: str) -> Iterator[Image]:
     index = list(yard.cameras).index(name)
     empty = _empty(yard, camera, index)
     rng = np.random.default_rng((yard.seed, 11, index))
+    grain = yard.noise * rng.standard_normal((2 * camera.size[1], 2 * camera.size[0], 3), np.float32)
     t = times(yard, name)
     states = [walker.states(t) for walker in yard.walkers]
     ways = [_ways(walker.states(np.arange(0, yard.seconds + yard.delays[name] + 1, 0.02))) for walker in yard.walkers]
@@ -77,8 +78,15 @@ def frames(yard: Yard, name: str) -> Iterator[Image]:
         if yard.sun is not None:
             _shade(picture, camera, pieces, np.array(yard.sun))
         _draw(picture, camera, pieces)
-        noise = rng.normal(0, yard.noise, picture.shape)
-        yield np.clip(np.rint(picture + noise), 0, 255).astype(np.uint8)
+        yield _noisy(picture, grain, rng)
+
+
+def _noisy(picture: Image, grain: NDArray[np.float32], rng: np.random.Generator) -> Image:
+    """The picture with a part of a larger field of noise, another one each time."""
+    high, wide = picture.shape[:2]
+    v, u = rng.integers(high + 1), rng.integers(wide + 1)
+    noisy: Image = cv2.add(picture, grain[v : v + high, u : u + wide], dtype=cv2.CV_8U)
+    return noisy
 
 
 def _ways(states: Array) -> tuple[Array, Array]:

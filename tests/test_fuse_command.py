@@ -13,8 +13,9 @@ import cv2
 import numpy as np
 import pytest
 
+from samples.files import write_clip
 from samples.people import crossing
-from samples.yard import write_calibration, write_yard
+from samples.yard import frames, write_calibration, write_yard
 from visfuse_cli.fusing import clocks
 
 pytestmark = pytest.mark.contract
@@ -150,9 +151,11 @@ def test_a_camera_that_was_turned_is_named_and_does_no_harm(yard, scene, tmp_pat
         assert np.sqrt(np.mean(np.sum(rows[:, :3] ** 2, axis=1))) < 0.16
 
 
-def test_a_late_camera_is_named_and_its_offset_found(yard, tmp_path):
+def test_a_late_camera_is_named_and_its_offset_found(yard, scene, tmp_path):
     late = tmp_path / "late"
-    write_yard(replace(yard, delays=yard.delays | {"cam3": 0.3}), late)
+    shutil.copytree(scene, late)
+    slow = replace(yard, delays=yard.delays | {"cam3": 0.3})
+    write_clip(late / "cam3.mp4", frames(slow, "cam3"), yard.cameras["cam3"].size, yard.rates["cam3"], 23)
     done = run(late, "--out", tmp_path / "run", "--no-video", "--no-report", "--estimate-offsets", "--json")
     assert done.returncode == 0, done.stderr
     offsets = json.loads(done.stdout)["offsets"]
