@@ -10,6 +10,7 @@ from visfuse_cli.records import Array
 
 HALF_SHARE = 0.33  # half of the usual row's width, as a share of the box's
 REACH_SIGMA = 0.06  # m: how much people's heads and feet differ from the usual outline
+LEVEL_M = 0.05  # m: how flat the ground is taken to be, and how upright people
 DRIFT = 3e-4  # m a look: bodies bend, and shadows come and go
 
 
@@ -58,6 +59,11 @@ class Body:
     ends: Ends
     width: Scale
     half: Scale
+
+    def level(self, centroid: bool) -> tuple[float, float]:
+        """How high above the ground the tracked point is, the centroid or the foot, m, and give or take what."""
+        share = 0.5 if centroid else 0.0
+        return share * self.ends.height, float(np.hypot(LEVEL_M, share * np.sqrt(self.ends.cov[0, 0])))
 
 
 def usual_body(height: float, height_sigma: float, width: float, looks: float) -> Body:

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from visfuse_cli.fusing.estimate import Sights, at_one_time, fuse, pair_up
+from visfuse_cli.fusing.body import LEVEL_M
+from visfuse_cli.fusing.estimate import Sights, at_one_time, fuse, pair_up, stand
 from visfuse_cli.fusing.noise import disagreement, restlessness
 from visfuse_cli.fusing.person import ASSUMED, BOX, DT, LEVER, VARIANCE, Person, Z
 from visfuse_cli.fusing.settings import FuseConfig
@@ -81,8 +82,10 @@ def conclude(person: Person, P: Array, config: FuseConfig) -> Path | None:
         sigma_a = restlessness(*places, t, config.filter, person.start)
         belief, nis = _filtered(person, sights, P, t, state, config, noise, sigma_a)
         pixels, J = project(P[sights.camera], belief.mean[sights.owner, :3])
-    cov = belief.cov.copy()
-    cov[:, :3, :3] += BODY_SIGMA**2 * noise * np.eye(3) + _by_body(sights, J, lever, person.body.ends.cov, len(t))
+    cov, centroid = belief.cov.copy(), config.fusion.point == "centroid"
+    cov[:, :3, :3] += BODY_SIGMA**2 * noise * np.eye(3) + _by_body(
+        sights, J, lever, person.body.ends.cov, len(t), centroid
+    )
     cov[:, 2, 2] += UPRIGHT_SIGMA**2 + (EDGE_PX / float(np.median(np.linalg.norm(J[:, :, 2], axis=1)))) ** 2
     belief = Gaussian(belief.mean, cov)
     residual = np.full((*seen.shape, 2), np.nan)
@@ -122,15 +125,17 @@ def _sights(rows: Array, seen: NDArray[np.bool_], state: Array, P: Array, ends: 
     return at_one_time(sights, P, Gaussian(state, np.zeros((len(state), 6, 6)))), lever
 
 
-def _by_body(sights: Sights, J: Array, lever: Array, ends: Array, count: int) -> Array:
+def _by_body(sights: Sights, J: Array, lever: Array, ends: Array, count: int, centroid: bool) -> Array:
     """Covariances (count, 3, 3) of the positions that come from the doubt of the body's ends (3, 3): one for all."""
     J_W = np.swapaxes(J, -1, -2) @ np.linalg.inv(sights.R)
     information, push = np.tile(np.eye(3), (count, 1, 1)), np.zeros((count, 3, 3))
     np.add.at(information, sights.owner, J_W @ J)
     np.add.at(push, sights.owner, (J_W @ J[:, :, 2:]) * lever[:, None])
+    number = np.bincount(sights.owner, minlength=count)
+    information[number == 1, 2, 2] += LEVEL_M**-2  # one camera alone, and the height as it is known
+    push[number == 1, 2, 0] += 0.5 * centroid * LEVEL_M**-2
     moved = np.asarray(np.linalg.solve(information, push), dtype=float)
-    seen = np.bincount(sights.owner, minlength=count) >= 2
-    moved[~seen] = moved[seen].mean(axis=0) if seen.any() else 0.0
+    moved[number == 0] = moved[number > 0].mean(axis=0)
     return moved @ ends @ np.swapaxes(moved, -1, -2)
 
 
@@ -152,8 +157,10 @@ def _filtered(
     bank: Bank | None = None
     prior, posterior, transitions = [], [], []
     bounds = np.searchsorted(scaled.owner, np.arange(len(t) + 1))
+    level = person.body.level(config.fusion.point == "centroid")
     for k in range(len(t)):
-        F, Q = held_motion(float(t[k] - t[k - 1]) if k else 0.0, sigma_a, config.filter)
+        dt = float(t[k] - t[k - 1]) if k else 0.0
+        F, Q = held_motion(dt, sigma_a, config.filter)
         ahead = gaussian.predict(belief, F, Q) if k else belief
         now = slice(bounds[k], bounds[k + 1])
         if now.start == now.stop:
@@ -167,6 +174,8 @@ def _filtered(
             banks: list[Bank | None] = [bank]
             after = fuse(config.fusion.method, Gaussian(ahead.mean[None], ahead.cov[None]), one, P, banks)
             belief, bank = Gaussian(after.mean[0], after.cov[0]), banks[0]
+        if now.stop - now.start == 1:
+            belief = stand(belief, *level, dt)
         prior.append(ahead)
         posterior.append(belief)
         transitions.append(F)

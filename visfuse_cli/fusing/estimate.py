@@ -11,12 +11,13 @@ from numpy.typing import NDArray
 from visfuse_cli.maths import fusion, fusion_rivals, triangulation
 from visfuse_cli.maths.assignment import gate_size
 from visfuse_cli.maths.fusion_rivals import Bank
-from visfuse_cli.maths.gaussian import inverse, times, transpose
+from visfuse_cli.maths.gaussian import inverse, times, transpose, update
 from visfuse_cli.maths.multiview import project
 from visfuse_cli.records import Array, Gaussian
 from visfuse_cli.vision.matching import agree
 
 Rows = NDArray[np.intp]
+LEVEL_S = 2.0  # s in which the ground and somebody's height, taken as known, count as one look
 RIVALS = {
     "naive": fusion_rivals.naive,
     "kim": fusion_rivals.kim,
@@ -148,6 +149,16 @@ def fuse(method: str, prior: Gaussian, sights: Sights, P: Array, banks: list[Ban
         fused = RIVALS[method](bank)
         mean[person], cov[person] = fused.mean, fused.cov
     return Gaussian(mean, cov)
+
+
+def stand(belief: Gaussian, level: float, sigma: float, dt: float) -> Gaussian:
+    """A belief (n,) of somebody whom one camera alone sees, known to be at `level` m, give or take `sigma`, from height.
+
+    One look's ray and a height are a place. What is assumed is the same in all looks: it counts once in LEVEL_S.
+    """
+    H = np.eye(1, len(belief.mean), 2)
+    R = np.array([[sigma**2 * max(LEVEL_S / max(dt, 1e-3), 1.0)]])
+    return update(belief, level - belief.mean[2:3], H, R)[0]
 
 
 def _bank(bank: Bank | None, belief: Gaussian, cameras: int) -> Bank:

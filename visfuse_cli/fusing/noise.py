@@ -33,14 +33,15 @@ def disagreement(sights: Sights, residual: Array, t: Array) -> tuple[float, floa
     for camera in np.unique(sights.camera):
         mine = sights.camera == camera
         usual[mine] = np.median(sigma[mine], axis=0)
-    good = (sigma**2 < POOR * usual**2) & np.isfinite(residual)
+    count = np.bincount(sights.owner, minlength=len(t))
+    together = (count[sights.owner] >= 2)[:, None]  # nobody contradicts a camera that is alone
+    good = (sigma**2 < POOR * usual**2) & np.isfinite(residual) & together
     scaled = np.where(good, residual / sigma, 0.0)
     for camera in np.unique(sights.camera):  # what a camera errs by all the time moves no velocity
         mine = sights.camera == camera
         mean = scaled[mine].sum(axis=0) / np.maximum(good[mine].sum(axis=0), 1)
         scaled[mine] = np.where(good[mine], scaled[mine] - mean, 0.0)
     # A path has three degrees of freedom an instant, which take their share of the residuals away.
-    count = np.bincount(sights.owner, minlength=len(t))
     used = count[count >= 2]
     if not len(used):
         return USUAL, 1.0

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from visfuse_cli.fusing.audit import Audit
 from visfuse_cli.fusing.body import usual_body
-from visfuse_cli.fusing.estimate import Sights, at_one_time, consistent, fuse
+from visfuse_cli.fusing.estimate import Sights, at_one_time, consistent, fuse, stand
 from visfuse_cli.fusing.person import History, Person
 from visfuse_cli.fusing.settings import FilterSettings, FuseConfig
 from visfuse_cli.maths import fusion_rivals, gaussian
@@ -78,6 +78,7 @@ class Tracker:
         self.P, self.config = P, config
         self.people: list[Person] = []
         self._next_id = 1
+        self._dt = 0.0  # s from the instant before the latest
         self.audit = Audit(len(P))
 
     @property
@@ -95,7 +96,8 @@ class Tracker:
         if not self.people:
             return
         settings = self.config.filter
-        F, Q = motion(t - self.people[0].t, settings.sigma_a, settings.sigma_z)
+        self._dt = t - self.people[0].t
+        F, Q = motion(self._dt, settings.sigma_a, settings.sigma_z)
         ahead = gaussian.predict(self.beliefs, F, Q)
         for k, person in enumerate(self.people):
             person.belief, person.t = Gaussian(ahead.mean[k], ahead.cov[k]), t
@@ -120,6 +122,9 @@ class Tracker:
             seen = {camera: sightings[k][camera] for camera in cameras}
             person.bank = banks[k]
             person.belief = Gaussian(after.mean[k], after.cov[k])
+            if len(seen) == 1:
+                level, sigma = person.body.level(self.config.fusion.point == "centroid")
+                person.belief = stand(person.belief, level, sigma, self._dt)
             self._remember(person, frame, seen)
 
     def _expected(self, used: Sights, good: NDArray[np.bool_], prior: Gaussian) -> NDArray[np.bool_]:
@@ -203,7 +208,7 @@ class Tracker:
                 gone = gone or ("never confirmed" if t - person.first_seen > 4 * life.confirm_s + 1.0 else "")
             elif t - person.last_seen > life.max_coast_s or person.missed >= life.max_missed:
                 gone = "lost"
-            elif views < 2 and t - person.last_pair > life.max_coast_s / 2:
+            elif views < 2 and t - person.last_seen > life.max_coast_s / 2:
                 gone = "left"
             else:
                 gone = ""
