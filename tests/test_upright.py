@@ -52,13 +52,13 @@ def masks(P: np.ndarray, points: np.ndarray) -> dict[int, np.ndarray]:
 
 
 def test_what_one_camera_alone_sees_beside_somebody_is_nobodys():
-    P = ring()
+    P = ring(high=5.0)
     angle, up = np.meshgrid(np.linspace(0, 2 * np.pi, 24), np.arange(0.05, 1.75, 0.04))
     body = np.column_stack([0.2 * np.cos(angle.ravel()), 0.2 * np.sin(angle.ravel()), up.ravel()])
     seen = masks(P, body)
     blank = {c: np.zeros((480, 640), np.uint8) for c in range(4)}
     toward = -np.linalg.solve(P[0, :, :3], P[0, :, 3])[:2]
-    mirrored = np.array([*(0.95 * toward / np.linalg.norm(toward)), 0.0])  # on the ground before the feet
+    mirrored = np.array([*(0.8 * toward / np.linalg.norm(toward)), 0.0])  # on the ground before the feet
     u, v = np.rint(multiview.project(P[0], mirrored)[0]).astype(int)
     beside = (slice(v - 12, v + 12), slice(u - 12, u + 12))
     person = seen[0].copy()
@@ -66,7 +66,7 @@ def test_what_one_camera_alone_sees_beside_somebody_is_nobodys():
     room = backed(P, seen, blank, np.zeros((1, 3)))[0]
     own = covered(room[0], (0, 0, 640, 480))
     assert own[person > 0].all()
-    assert np.mean(own[beside][person[beside] == 0]) < 0.2
+    assert np.mean(own[beside][person[beside] == 0]) < 0.3
     seen[1][:], seen[2][:] = 0, 0  # two of three others see nothing at all: nothing is left to be limited by
     assert 0 not in backed(P, seen, blank, np.zeros((1, 3)))[0]
     assert backed(P[:2], {c: seen[c] for c in (0, 1)}, blank, np.zeros((1, 3))) == [{}]  # one other is no judge

@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 from visfuse_cli.maths import multiview
 from visfuse_cli.records import Array, Image
 
-STEP_M = 0.12  # side of the cells that the room about somebody is divided into
-RADIUS_M, LOW_M, HIGH_M = 0.96, -0.12, 2.4  # of that room, about and above where somebody stands
+STEP_M = 0.15  # side of the cells that the room about somebody is divided into
+RADIUS_M, LOW_M, HIGH_M = 0.9, -0.12, 2.28  # of that room, about and above where somebody stands
 CORNER = 0.7  # cells' sides from a cell's middle to its corners, as most pictures see them
+BLOCK = 4  # px: side of the blocks in which they are drawn
 AGAINST = 2  # cameras at least that must see nothing in a cell to call it empty: one may have its sight blocked
 
 
@@ -69,13 +70,13 @@ def _look(
 
 
 def covered(boxes: Array, window: tuple[int, int, int, int]) -> NDArray[np.bool_]:
-    """Which pixels of a window [left, top, right, bottom] lie in one of the boxes (n, 4), the last row left out."""
+    """Which pixels of a window [left, top, right, bottom] lie in one of the boxes (n, 4), to blocks of BLOCK px."""
     left, top, right, bottom = window
-    low, high = np.array([left, top]), np.array([right, bottom])
-    u0, v0 = (np.clip(boxes[:, :2], low, high) - low).T
-    u1, v1 = (np.clip(boxes[:, 2:], low, high) - low).T
-    wide, tall = right - left + 1, bottom - top + 1
-    corners = np.concatenate([v0 * wide + u0, v1 * wide + u1, v0 * wide + u1, v1 * wide + u0])
+    wide, tall = -(-(right - left) // BLOCK), -(-(bottom - top) // BLOCK)
+    u0, v0, u1, v1 = ((boxes - [left, top, left, top]) // BLOCK + [0, 0, 1, 1]).T
+    u0, u1, v0, v1 = (np.clip(u, 0, most) for u, most in ((u0, wide), (u1, wide), (v0, tall), (v1, tall)))
+    corners = np.concatenate([v0 * (wide + 1) + u0, v1 * (wide + 1) + u1, v0 * (wide + 1) + u1, v1 * (wide + 1) + u0])
     sign = np.repeat([1.0, 1.0, -1.0, -1.0], len(boxes))
-    layers = np.bincount(corners, sign, wide * tall).reshape(tall, wide)
-    return np.asarray(layers.cumsum(axis=0).cumsum(axis=1)[:-1, :-1] > 0.5)
+    layers = np.bincount(corners, sign, (wide + 1) * (tall + 1)).reshape(tall + 1, wide + 1)
+    blocks = layers.cumsum(axis=0).cumsum(axis=1)[:-1, :-1] > 0.5
+    return blocks.repeat(BLOCK, axis=0)[: bottom - top].repeat(BLOCK, axis=1)[:, : right - left]
