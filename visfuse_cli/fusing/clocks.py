@@ -7,13 +7,18 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from visfuse_cli.fusing.audit import LEAST, Finding
+from visfuse_cli.fusing.audit import LEAST
+from visfuse_cli.fusing.conclude import conclude
+from visfuse_cli.fusing.person import Person
+from visfuse_cli.fusing.settings import FuseConfig
 from visfuse_cli.maths import multiview, people
+from visfuse_cli.maths.gaussian import times
 from visfuse_cli.records import Array
 
 STEP_S = 0.05  # of the coarse search
 NEAR_M = 0.35  # m by which one camera alone misses a place on the ground
 TALL = (0.55, 1.4)  # share of the usual height that a blob of one person has
+ROUNDS, SETTLED_S = 8, 0.001  # of the fine search: rounds at most, and the step (s) at which it ends
 UNLIKELY = 0.05  # gain in agreement from which on a shift is believed
 
 
@@ -92,11 +97,31 @@ def _nearest(t: Array, when: Array) -> NDArray[np.intp]:
     return np.where(np.abs(t[left] - when) <= np.abs(t[right] - when), left, right)
 
 
-def corrected(offsets: Array, findings: list[Finding]) -> Array:
-    """Offsets (C,) s once what the tracks say of each camera's lateness is added; the first camera keeps its own."""
-    late = np.array([each.late if each.sightings >= LEAST else np.nan for each in findings])
-    if np.isnan(late[0]):
-        late = late - np.nanmedian(late) if np.isfinite(late).any() else late
-    else:
-        late = late - late[0]
-    return np.asarray(offsets + np.nan_to_num(late))
+def refined(people: list[Person], P: Array, config: FuseConfig) -> Array:
+    """How much later (C,) s than thought cameras P (C, 3, 4) saw people, by their settled paths; the first one's is 0.
+
+    A late camera drags the paths after itself, so that only a share of its lateness shows at once: in several rounds,
+    all of it does. A camera of which too little is known is left as it is.
+    """
+    plain = config.model_copy(update={"filter": config.filter.model_copy(update={"adapt": False})})
+    total = np.zeros(len(P))
+    for _ in range(ROUNDS):
+        pull, weight, count = np.zeros(len(P)), np.zeros(len(P)), np.zeros(len(P), dtype=int)
+        for path in (conclude(person, P, plain) for person in people):
+            if path is None:
+                continue
+            _, J = multiview.project(P, path.belief.mean[:, None, :3])
+            moved = times(J, path.belief.mean[:, None, 3:])  # px/s in each picture
+            known = path.seen & (np.count_nonzero(path.seen, axis=1) >= 2)[:, None]
+            scale = np.where(known, np.sum(J**2, axis=(-2, -1)), 1.0)
+            pull += np.where(known, np.sum(moved * np.nan_to_num(path.residual), axis=-1) / scale, 0.0).sum(axis=0)
+            weight += np.where(known, np.sum(moved**2, axis=-1) / scale, 0.0).sum(axis=0)
+            count += known.sum(axis=0)
+        late = np.where(count >= LEAST, pull / np.maximum(weight, 1e-9), 0.0)
+        late -= late[0]
+        for person in people:
+            person.history.delay(late)
+        total += late
+        if np.abs(late).max() < SETTLED_S:
+            break
+    return total

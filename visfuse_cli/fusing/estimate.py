@@ -152,7 +152,7 @@ def fuse(method: str, prior: Gaussian, sights: Sights, P: Array, banks: list[Ban
 
 
 def stand(belief: Gaussian, level: float, sigma: float, dt: float) -> Gaussian:
-    """A belief (n,) of somebody whom one camera alone sees, known to be at `level` m, give or take `sigma`, from height.
+    """A belief (n,) of somebody whom one camera alone sees, and who is `level` m up, give or take `sigma`.
 
     One look's ray and a height are a place. What is assumed is the same in all looks: it counts once in LEVEL_S.
     """

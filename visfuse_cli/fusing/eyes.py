@@ -42,6 +42,9 @@ class Eyes(Protocol):
     zoom: Array  # (C,): pixels of the footage per pixel measured in
     open: NDArray[np.bool_]  # (C,): which cameras are in the latest set
 
+    def restart(self) -> None:
+        """Forget what was learnt since the beginning."""
+
     def detect(self, instant: FrameSet) -> None:
         """Look at a set of frames."""
 
@@ -74,6 +77,9 @@ class BoxEyes:
         self._watch = BoxWatch(views, self.P, config)
         self._now: dict[int, Array] = {}
         self._dt: dict[int, float] = {}
+
+    def restart(self) -> None:
+        """Boxes from outside are never learnt from."""
 
     def detect(self, instant: FrameSet) -> None:
         """Take the boxes of a set's frames."""
@@ -123,6 +129,11 @@ class PictureEyes:
         self._watch = PictureWatch(self._cameras, self.P, config)
         self._dt: dict[int, float] = {}
         self._pool = ThreadPoolExecutor(min(THREADS, thread_cap() or THREADS))
+
+    def restart(self) -> None:
+        """Begin again with the empty scenes as backgrounds."""
+        for camera in self._cameras:
+            camera.restart()
 
     def detect(self, instant: FrameSet) -> None:
         """Find out what moves in each picture of a set."""

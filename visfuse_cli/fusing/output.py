@@ -54,6 +54,7 @@ def _summary(path: Path, names: list[str]) -> dict[str, Any]:
     distance = float(np.sum(np.linalg.norm(np.diff(ground, axis=0), axis=1)))
     mean = distance / duration if duration > 0 else 0.0
     doubt = np.sqrt(np.trace(cov[0, :2, :2]) / 2 + np.trace(cov[-1, :2, :2]) / 2) / duration if duration > 0 else 0.0
+    doubt = float(np.hypot(doubt, _wiggle(path.belief.mean[:, 3:5], cov[:, 3:5, 3:5])))
     used = path.seen.any(axis=1)
     error = np.sqrt(np.nanmean(np.sum(path.residual**2, axis=2))) if path.seen.any() else None
     return {
@@ -62,7 +63,7 @@ def _summary(path: Path, names: list[str]) -> dict[str, Any]:
         "n_frames": int(np.count_nonzero(used)),
         "distance": distance,
         "speed": mean,
-        "speed_ci95": [max(0.0, mean - Z95 * float(doubt)), mean + Z95 * float(doubt)],
+        "speed_ci95": [max(0.0, mean - Z95 * doubt), mean + Z95 * doubt],
         "height": path.height,
         "reprojection_px": None if error is None else float(error),
         "cameras": {name: int(np.count_nonzero(path.seen[:, c])) for c, name in enumerate(names)},
@@ -72,3 +73,16 @@ def _summary(path: Path, names: list[str]) -> dict[str, Any]:
         "sigma_a": path.sigma_a,
         "ended": path.ended_by,
     }
+
+
+def _wiggle(velocity: Array, cov: Array) -> float:
+    """The speed (m/s) that errors across the path add to its length by wiggles, or take from it by rounded corners.
+
+    velocity (T, 2) m/s along the ground, cov (T, 2, 2): a velocity off by d across is longer by d^2 / 2 v; as much
+    again for corners.
+    """
+    speed = np.linalg.norm(velocity, axis=1)
+    unit = velocity / np.maximum(speed, 1e-6)[:, None]
+    across = np.trace(cov, axis1=1, axis2=2) - np.einsum("ti,tij,tj->t", unit, cov, unit)
+    sigma = np.sqrt(np.clip(across, 0, None))
+    return float(np.mean(np.minimum(sigma**2 / np.maximum(speed, 1e-6), sigma)))

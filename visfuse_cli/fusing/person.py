@@ -53,6 +53,10 @@ class History:
         """Sightings (T, C, COLUMNS)."""
         return np.array(self._rows, dtype=float).reshape(-1, self._cameras, COLUMNS)
 
+    def delay(self, late: Array) -> None:
+        """Say of each camera's sightings that they were made later than was thought, by `late` (C,) s."""
+        np.frombuffer(self._rows).reshape(-1, self._cameras, COLUMNS)[:, :, DT] += late
+
     def cut(self, length: int) -> None:
         """Forget what came after the first `length` instants."""
         del self.frame[length:], self.t[length:], self.denied[length:], self._state[6 * length :]

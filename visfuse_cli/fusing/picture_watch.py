@@ -34,12 +34,17 @@ class Camera:
     """One camera's eye: straight pictures, their background, and what moves in the latest."""
 
     def __init__(self, straight: Straight, empty: Image, config: FuseConfig) -> None:
-        settings = config.background
         self.straight = straight
+        self._empty, self._settings = empty, config.background
+        self.restart()
+
+    def restart(self) -> None:
+        """Begin with the empty scene as background."""
+        settings = self._settings
         self._background = Background(settings.model, settings.threshold, settings.shadow_ratio, settings.memory_s)
-        self._background.start(empty)
-        self._picture: Image = empty
-        self.labels: Image = np.zeros(empty.shape[:2], np.uint8)
+        self._background.start(self._empty)
+        self._picture: Image = self._empty
+        self.labels: Image = np.zeros(self._empty.shape[:2], np.uint8)
         self.mask = self.labels
 
     def look(self, image: Image) -> None:

@@ -85,7 +85,7 @@ class FilterSettings(Section):
 
     sigma_a: float = Field(0.8, gt=0, le=50, description="m/s^2 per root Hz: how hard people change pace and course")
     hold_s: float = Field(
-        0.4, gt=0.01, le=10, description="s: how long a change of pace goes on; whole tracks are smoothed with it"
+        0.8, gt=0.01, le=10, description="s: how long a change of pace goes on; whole tracks are smoothed with it"
     )
     sigma_z: float = Field(0.03, gt=0, le=50, description="m/s^2 per root Hz: the same, up and down")
     start_speed: float = Field(1.0, gt=0, le=20, description="m/s: speed that may be there when a person is first seen")

@@ -36,11 +36,11 @@ def run(request: RunRequest) -> RunResult:
         Run(request.progress) as run_,
         TrackSpool(folder, "fuse-cameras", request.seed, "world") as spool,
     ):
-        if request.options["estimate_offsets"]:
-            offsets = estimated_offsets(scene, offsets, request, run_)
         sources = open_footage(scene, request)
         with run_.stage("warm up"):
             eyes = eyes_of(scene, sources, config)
+        if request.options["estimate_offsets"]:
+            offsets = estimated_offsets(scene, eyes, offsets, request, run_)
         tracker = Tracker(eyes.P, config)
         for ended in follow(scene, sources, eyes, tracker, offsets, run_):
             run_.count("sets of frames")

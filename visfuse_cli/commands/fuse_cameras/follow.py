@@ -19,8 +19,8 @@ from visfuse_cli.records import RunRequest
 
 CLOCK_S = 60.0  # s of footage from which clocks are estimated
 CLOCK_STEP_S = 0.2  # s between the frames that the first, coarse round looks at
-CLOCK_ROUNDS = 6
-CLOCK_DONE_S = 0.004
+CLOCK_ROUNDS = 3  # through the footage: where clocks were far off, others are believed once they are not
+CLOCK_DONE_S = 0.02
 
 
 def eyes_of(scene: Scene, sources: dict[str, VideoSource], config: FuseConfig) -> Eyes:
@@ -59,15 +59,15 @@ def follow(
         yield ended
 
 
-def estimated_offsets(scene: Scene, offsets: dict[str, float], request: RunRequest, run_: Run) -> dict[str, float]:
+def estimated_offsets(
+    scene: Scene, eyes: Eyes, offsets: dict[str, float], request: RunRequest, run_: Run
+) -> dict[str, float]:
     """The clocks' offsets (s by camera): places that cameras see alone agree roughly, tracks of all of them exactly."""
     config: FuseConfig = request.config
     begin = request.start or 0.0
     part = replace(request, end=min(begin + CLOCK_S, request.end or np.inf))
-    sources = open_footage(scene, part)
-    eyes = eyes_of(scene, sources, config)
     walks = [clocks.Walks() for _ in scene.names]
-    for camera, source in enumerate(sources.values()):
+    for camera, source in enumerate(open_footage(scene, part).values()):
         due = -np.inf
         for frame in run_.frames(source):
             if frame.t >= due:
@@ -81,13 +81,13 @@ def estimated_offsets(scene: Scene, offsets: dict[str, float], request: RunReque
         )
         return offsets
     for _ in range(CLOCK_ROUNDS):
-        sources = open_footage(scene, part)
-        tracker = Tracker(eyes.P, config)
-        eyes = eyes_of(scene, sources, config)
-        for _ in follow(scene, sources, eyes, tracker, dict(zip(scene.names, found.tolist(), strict=True)), run_):
-            pass
-        better = clocks.corrected(found, tracker.audit.findings(eyes.zoom))
-        moved, found = float(np.abs(better - found).max()), better
-        if moved < CLOCK_DONE_S:
+        eyes.restart()
+        tracker, now = Tracker(eyes.P, config), dict(zip(scene.names, found.tolist(), strict=True))
+        ended = follow(scene, open_footage(scene, part), eyes, tracker, now, run_)
+        people = [person for some in ended for person in some] + tracker.finish()
+        late = clocks.refined(people, eyes.P, config)
+        found = found + late
+        if np.abs(late).max() < CLOCK_DONE_S:
             break
+    eyes.restart()
     return {name: round(float(seconds), 4) for name, seconds in zip(scene.names, found, strict=True)}
