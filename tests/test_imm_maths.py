@@ -142,6 +142,13 @@ def test_an_instant_does_not_depend_on_the_models_order_nor_on_units(seed, order
     np.testing.assert_allclose(other_mu, plain_mu[order], atol=1e-8)
 
 
+def test_models_change_alike_at_every_frame_rate():
+    whole, half = (np.exp(imm.changes(4, dt, 3.0)) for dt in (0.2, 0.1))
+    np.testing.assert_allclose(half @ half, whole, atol=1e-12)
+    np.testing.assert_allclose(np.exp(imm.changes(4, 1e-4, 3.0))[0, 0], 1 - 1e-4 / 3.0, atol=1e-8)
+    np.testing.assert_array_equal(np.exp(imm.changes(4, 0.0, 3.0)), np.eye(4))
+
+
 def test_a_short_model_in_the_common_state_is_that_model():
     rng = np.random.default_rng(9)
     spare = np.repeat([1.0, 4.0, 9.0], 2)

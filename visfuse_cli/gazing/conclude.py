@@ -66,7 +66,8 @@ def _part(target: Target, ground: GroundMap) -> _Part | None:
         return None
     last = measured[-1] + 1
     steps = target.steps[:last]
-    banks = target.models.smoothed(steps) if target.config.smooth else [step.filtered for step in steps]
+    t = np.array([look.t for look in target.looks[:last]])
+    banks = target.models.smoothed(steps, t) if target.config.smooth else [step.filtered for step in steps]
     beliefs = [belief(bank) for bank in banks]
     mean, cov = np.stack([b.mean for b in beliefs]), np.stack([b.cov for b in beliefs])
     J = ground_shift(ground, mean[:, :2])

@@ -47,6 +47,11 @@ class Finder:
         self._views: deque[View] = deque()
         self._candidates: list[list[Array]] = []  # of each, its boxes [u0, v0, u1, v1] px so far
 
+    def rest(self) -> None:
+        """Nothing is looked for in this picture."""
+        self._views.clear()
+        self._candidates = []
+
     def look(self, view: View) -> tuple[list[Array], list[View]]:
         """Quads (4, 2) px of what moved for some frames and is not followed, and the views from theirs to this one."""
         views = self._views

@@ -27,7 +27,7 @@ class Courses:
             "cd": (settings.sigma_pull**2, way),
         }
         self._motions = [(KINDS[name], *densities[name]) for name in self.names]
-        self._log_p = imm.transition(len(self.names), settings.stay)
+        self._sojourn = settings.sojourn
 
     def start(self, place: Gaussian, velocity: Gaussian) -> Bank:
         """Every motion from a place (2,) and a velocity (2,), equally likely."""
@@ -54,11 +54,15 @@ class Courses:
                 Q.append(course.noise(x[..., k, :], np.array(dt), kind, speed, turn, SPARE))
             return np.stack(moved, axis=-2), np.stack(F, axis=-3), np.stack(Q, axis=-3)
 
-        return imm.predict(bank, self._log_p, advance, course.ANGLES)
+        return imm.predict(bank, self._changes(dt), advance, course.ANGLES)
 
-    def smoothed(self, steps: Sequence[Step]) -> list[Bank]:
-        """The bank of every instant given all."""
-        return imm.smooth(steps, self._log_p, course.ANGLES)
+    def smoothed(self, steps: Sequence[Step], t: Array) -> list[Bank]:
+        """The bank of every instant t (T,) s given all."""
+        log_p = np.stack([self._changes(dt) for dt in np.diff(t, prepend=t[0])])
+        return imm.smooth(steps, log_p, course.ANGLES)
+
+    def _changes(self, dt: float) -> Array:
+        return imm.changes(len(self.names), dt, self._sojourn)
 
 
 def combined(bank: Bank) -> Gaussian:

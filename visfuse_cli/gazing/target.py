@@ -48,6 +48,11 @@ class Expected:
     depth: float
     dt: float
 
+    @property
+    def box(self) -> Array | None:
+        """[x, y, w, h] px; none out of sight."""
+        return box_of(self.quad) if np.isfinite(self.quad).all() else None
+
 
 @dataclass(slots=True)
 class Target:
@@ -70,6 +75,17 @@ class Target:
     ahead: list[Gaussian | None] = field(default_factory=list)  # the belief a latency later, look by look
     ended_by: str = ""
     earlier: Target | None = None  # what was seen of it before it was lost or away
+
+    @property
+    def box(self) -> Array | None:
+        """The latest box [x, y, w, h] px; none out of sight."""
+        box = self.looks[-1].box
+        return box if np.isfinite(box).all() else None
+
+    @property
+    def measured(self) -> bool:
+        """Whether it was seen there."""
+        return self.looks[-1].z is not None
 
     @property
     def height(self) -> float:

@@ -50,7 +50,18 @@ def transition(models: int, stay: float) -> Array:
     """log p_ij (r, r), from model i to model j: `stay` on the diagonal, the rest shared. Jia 2008, eq. 37."""
     p = np.full((models, models), (1 - stay) / max(models - 1, 1))
     np.fill_diagonal(p, stay if models > 1 else 1.0)
-    return np.log(p)
+    with np.errstate(divide="ignore"):  # over no time at all nothing changes
+        return np.asarray(np.log(p))
+
+
+def changes(models: int, dt: float, sojourn: float) -> Array:
+    """log p_ij (r, r) over dt (s), each model lasting `sojourn` (s) on the average. Jia 2008, eq. 37, at any rate.
+
+    A change may come at any instant, to any other model: two half steps are one whole step.
+    """
+    if models == 1:
+        return transition(1, 1.0)
+    return transition(models, float((1 + (models - 1) * np.exp(-models / (models - 1) * dt / sojourn)) / models))
 
 
 def embedded(F: Array, Q: Array, index: Sequence[int], spare: Array) -> tuple[Array, Array]:
@@ -152,13 +163,14 @@ def combined(bank: Bank, angles: tuple[int, ...] = ()) -> Gaussian:
 def smooth(steps: Sequence[Step], log_p: Array, angles: tuple[int, ...] = ()) -> list[Bank]:
     """Every instant's bank given the whole recording: a fixed-interval smoother over pairs of models.
 
+    log_p (r, r), or that of the way to every step (T, r, r), of which the first is not read.
     What the future says of the state, if model i comes next, is the step back from model i's smoothed state, less what
     it began with; each model j of now takes it in as a measurement, and the pairs are weighed by how well j fits it.
     With one model this is the Rauch-Tung-Striebel pass. Raises LinAlgError where a covariance is singular.
     """
-    banks = [steps[-1].filtered]
-    for now, after in zip(steps[-2::-1], steps[:0:-1], strict=True):
-        banks.append(_smoothed(now.filtered, after, banks[-1], log_p, angles))
+    banks, ways = [steps[-1].filtered], [log_p] * len(steps) if log_p.ndim == 2 else log_p
+    for now, after, way in zip(steps[-2::-1], steps[:0:-1], ways[:0:-1], strict=True):
+        banks.append(_smoothed(now.filtered, after, banks[-1], way, angles))
     return banks[::-1]
 
 

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from visfuse_cli.maths.planes import in_right, projected
-from visfuse_cli.moving.target import Head
+from visfuse_cli.moving.head import Head
 from visfuse_cli.records import Array, Image, StereoRig
 from visfuse_cli.vision import drawing
 

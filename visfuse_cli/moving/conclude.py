@@ -11,11 +11,12 @@ import numpy as np
 from visfuse_cli.maths import imm
 from visfuse_cli.moving.models import P, V
 from visfuse_cli.moving.target import Target
-from visfuse_cli.records import Array, Gaussian
+from visfuse_cli.records import Array, Gaussian, StereoRig
 
 FEWEST = 2  # measurements that make a part of a track
 Z95 = 1.959963984540054
 EGO_SHARE = 0.02  # of the camera's way: error of its pose that a static thing may seem to move by
+DRIFT_PX = np.array([0.1, 0.1, 0.02])  # of place and disparity: what the same template is off by in every frame
 SLOWEST = 0.12  # m/s: what is slower on the whole is not said to move
 
 
@@ -64,8 +65,9 @@ def _part(target: Target, pose_cov: Callable[[int], Array]) -> Settled | None:
         return None
     last = int(np.flatnonzero(measured)[-1]) + 1
     history, measured = target.history[:last], measured[:last]
+    t = np.array([seen.t for seen in history])
     if target.config.smooth:
-        banks = target.models.smoothed([seen.step for seen in history])
+        banks = target.models.smoothed([seen.step for seen in history], t)
     else:
         banks = [seen.step.filtered for seen in history]
     common = [imm.combined(bank) for bank in banks]
@@ -75,8 +77,8 @@ def _part(target: Target, pose_cov: Callable[[int], Array]) -> Settled | None:
     return Settled(
         id=target.id,
         frame=[seen.frame for seen in history],
-        t=np.array([seen.t for seen in history]),
-        belief=Gaussian(mean, cov + of_pose),
+        t=t,
+        belief=Gaussian(mean, cov + of_pose + _of_template(target.rig, mean, history)),
         log_mu=np.stack([bank.log_mu for bank in banks]),
         names=target.models.names,
         boxes=[seen.boxes for seen in history],
@@ -115,6 +117,24 @@ def _of_pose(mean: Array, pose_cov: Array, history: list[Any]) -> Array:
     turn = np.stack([-reach[:, 2], 0 * reach[:, 0], reach[:, 0]], axis=1)  # d position / d theta
     J = np.concatenate([np.tile(np.eye(3), (len(mean), 1, 1)), turn[:, :, None]], axis=2)
     added[:, :3, :3] = J @ pose_cov @ np.swapaxes(J, 1, 2)
+    return added
+
+
+def _of_template(rig: StereoRig, mean: Array, history: list[Any]) -> Array:
+    """What the template's own place in the target adds (T, 6, 6): it stays off as it is and does not average out."""
+    added = np.zeros((len(mean), 6, 6))
+    fx, fy = np.diag(rig.left.K)[:2]
+    for k, seen in enumerate(history):
+        x, y, z = seen.head.inside(mean[k, :3])
+        J = np.array(
+            [
+                [z / fx, 0, -x * z / (fx * rig.baseline)],
+                [0, z / fy, -y * z / (fx * rig.baseline)],
+                [0, 0, -(z**2) / (fx * rig.baseline)],
+            ]
+        )
+        J = seen.head.R @ J * DRIFT_PX
+        added[k, :3, :3] = J @ J.T
     return added
 
 

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from visfuse_cli.moving.head import Head, Pair
 from visfuse_cli.moving.settings import ImmConfig
-from visfuse_cli.moving.target import Head, Pair
 from visfuse_cli.records import Array, Image, StereoRig
 from visfuse_cli.vision import clusters
 from visfuse_cli.vision.flow import own_motion

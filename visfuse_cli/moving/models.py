@@ -34,7 +34,6 @@ class Models:
     def __init__(self, settings: FilterSettings) -> None:
         self._settings = settings
         self.names = tuple(INDEX) if settings.kind == "imm" else (settings.kind,)
-        self._log_p = imm.transition(len(self.names), settings.stay)
 
     def start(self, position: Gaussian, velocity: Gaussian) -> Bank:
         """Every model from a place (3,) and a velocity (3,), equally likely."""
@@ -47,11 +46,14 @@ class Models:
         """The bank dt (s) later: mixed, then each by its own motion. Jia 2008, eqs. 23-26, 33-34."""
         motions = [imm.embedded(*self._motion(name, dt), INDEX[name], SPARE) for name in self.names]
         F, Q = (np.stack(part) for part in zip(*motions, strict=True))
-        return imm.predict(bank, self._log_p, lambda x: (times(F, x), F, Q))
+        return imm.predict(bank, self._changes(dt), lambda x: (times(F, x), F, Q))
 
-    def smoothed(self, steps: Sequence[Step]) -> list[Bank]:
-        """The bank of every instant given all."""
-        return imm.smooth(steps, self._log_p)
+    def smoothed(self, steps: Sequence[Step], t: Array) -> list[Bank]:
+        """The bank of every instant t (T,) s given all."""
+        return imm.smooth(steps, np.stack([self._changes(dt) for dt in np.diff(t, prepend=t[0])]))
+
+    def _changes(self, dt: float) -> Array:
+        return imm.changes(len(self.names), dt, self._settings.sojourn)
 
     def _motion(self, name: str, dt: float) -> tuple[Array, Array]:
         s = self._settings

@@ -50,10 +50,10 @@ class FilterSettings(Section):
     kind: Literal["imm", "drifting", "cv", "ca", "periodic", "csd", "cs", "cd"] = Field(
         "imm", description="all of them, or one alone; csd, cs and cd are those of a pan-tilt head"
     )
-    stay: float = Field(0.985, gt=0.5, lt=1, description="probability that a model goes on over one frame")
+    sojourn: float = Field(4.0, gt=0, le=1000, description="s that a motion goes on, on the average")
     q_drifting: float = Field(0.2, gt=0, description="m^2/s of a drifting point's walk")
-    q_cv: float = Field(0.05, gt=0, description="m^2 s^-3 of constant velocity: for straight ways")
-    q_ca: float = Field(4.0, gt=0, description="m^2 s^-5 of constant acceleration")
+    q_cv: float = Field(0.02, gt=0, description="m^2 s^-3 of constant velocity: for straight ways")
+    q_ca: float = Field(1.0, gt=0, description="m^2 s^-5 of constant acceleration")
     q_periodic: float = Field(0.05, gt=0, description="m^2 s^-3 of the periodic motion")
     omega: float = Field(1.0, gt=0, le=50, description="rad/s of the periodic motion")
     euler: bool = Field(False, description="the periodic motion by the paper's growing forward step")
@@ -71,10 +71,10 @@ class MeasureSettings(Section):
 
     good: float = Field(0.6, gt=0, lt=1, description="correlation from which on a target is recognised")
     fresh: float = Field(0.85, gt=0, lt=1, description="correlation below which its template is taken anew")
-    flow_sigma: float = Field(0.5, gt=0, le=50, description="px: noise of the mean flow over the target")
-    place_sigma: float = Field(1.0, gt=0, le=50, description="px: how far limbs move the middle of the template")
+    flow_sigma: float = Field(0.15, gt=0, le=50, description="px: noise of the mean flow over the target")
+    place_sigma: float = Field(0.15, gt=0, le=50, description="px: noise of the middle of the target's picture")
     disparity_sigma: float = Field(
-        0.15, gt=0, le=10, description="px: noise of the disparity beyond the matching's own"
+        0.06, gt=0, le=10, description="px: noise of the disparity beyond the matching's own"
     )
 
 

@@ -2,65 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from visfuse_cli.maths import imm
-from visfuse_cli.maths.assignment import gate_size
 from visfuse_cli.maths.imm import Bank, Step
 from visfuse_cli.maths.planes import in_right, projected, triangulated
+from visfuse_cli.moving.head import Head, Pair
+from visfuse_cli.moving.measure import across, measurement, updated
 from visfuse_cli.moving.models import SIZE, Models, P, V
 from visfuse_cli.moving.settings import ImmConfig
-from visfuse_cli.records import Array, Gaussian, Image, StereoRig
+from visfuse_cli.records import Array, Gaussian, StereoRig
 from visfuse_cli.vision import patches
 from visfuse_cli.vision.boxes import box_of
-from visfuse_cli.vision.disparity import region_shift
 from visfuse_cli.vision.looks import ALIKE, COASTED_S, HIDDEN, KEEP_LOOKS, SETTLED_S, looks, unlike
-from visfuse_cli.vision.patches import Alignment, Grey, Template
+from visfuse_cli.vision.patches import Alignment, Template
 
-STEP = 1e-3  # m, m/s: of the numerical Jacobian
-GATE = 1 - 1e-7
 STRETCH = 0.2  # by which a target's picture may be off the size that its distance gives it
 TRUST = 4.0  # times an alignment's own covariance
 NEAREST = 0.2  # m before the camera
 REACH = 3.0  # px of disparity around the expected one, at least
-FLOW_RIM = 4.0  # px from the edge of the picture, within which there is no saying what its flow is
 FASTER, FAST, SLACK_M = 2.0, 1.5, 0.5  # times its pace, m/s, m: how far a lost target may have come
-
-
-@dataclass(frozen=True, slots=True)
-class Head:
-    """Where the left camera is at one instant: x_world = R x_camera + T."""
-
-    t: float
-    R: Array
-    T: Array
-
-    def inside(self, points: Array) -> Array:
-        """World points (..., 3) m in the camera's frame."""
-        return np.asarray((points - self.T) @ self.R)
-
-    def outside(self, points: Array) -> Array:
-        """Points (..., 3) m of the camera's frame in the world."""
-        return np.asarray(points @ self.R.T + self.T)
-
-
-@dataclass(frozen=True, slots=True)
-class Pair:
-    """One pair of straight pictures: number, head, pictures by view, the left one's pyramid, and the flow to it, px."""
-
-    frame: int
-    head: Head
-    pictures: Mapping[str, Image]
-    levels: list[Grey]
-    flow: Array | None
-
-    @property
-    def size(self) -> tuple[int, int]:
-        """Width and height, px."""
-        return self.levels[0].shape[1], self.levels[0].shape[0]
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,7 +42,7 @@ class Seen:
 
 @dataclass(slots=True)
 class Target:
-    """A target that is followed; `size` (2,) m of its visible surface, `looks` (bands, 3) its colours.
+    """A target that is followed; `size` (2,) m of its visible surface, `colours` (bands, 3) what it looks like.
 
     `earlier` is what was seen of it before it was lost or away.
     """
@@ -91,7 +54,7 @@ class Target:
     bank: Bank
     size: Array
     sought: Template
-    looks: Array
+    colours: Array
     head: Head
     given: bool
     last_seen: float
@@ -101,6 +64,16 @@ class Target:
     seen_since: float = -np.inf  # s: since when it is seen without a break
     alone_at: float = 0.0  # s: when last no other target was where this one is
     earlier: Target | None = None
+
+    @property
+    def box(self) -> Array | None:
+        """The latest left box [x, y, w, h] px; none out of sight."""
+        return self.history[-1].boxes.get("left")
+
+    @property
+    def measured(self) -> bool:
+        """Whether it was seen there."""
+        return self.history[-1].measured
 
     @property
     def belief(self) -> Gaussian:
@@ -117,6 +90,11 @@ class Expected:
     depth: float
     doubt: float  # of the depth, as a share of it
 
+    @property
+    def box(self) -> Array | None:
+        """[x, y, w, h] px in the left view; none out of sight."""
+        return box_of(self.quads["left"]) if self.quads else None
+
 
 def start(
     identity: int,
@@ -130,7 +108,7 @@ def start(
     given: bool,
 ) -> Target | None:
     """Begin with a target in left and right quads (4, 2) px; None where it lies behind the camera."""
-    found = _across(rig, pair, left, right, 2 * REACH)
+    found = across(rig, pair, left, right, 2 * REACH)
     if found is not None:
         right = found[0]
     place = triangulated(rig, left.mean(axis=0), right.mean(axis=0))
@@ -181,10 +159,10 @@ def follow(target: Target, pair: Pair, expected: Expected, hidden: float) -> Non
     if found is not None:
         left, right, R, alignment = found
         R[0, 0] += (hidden * patches.side(left)[0]) ** 2  # what is left to be seen lies to one side
-        z, R = _measurement(target, left, right, R, pair.flow)
-        updated = _updated(target, step, z, R, head, before)
-        if updated is not None:
-            step, nis = updated
+        z, R = measurement(target.config.measure, left, right, R, pair.flow)
+        after = updated(target.rig, step, z, R, head, before)
+        if after is not None:
+            step, nis = after
             target.bank = step.filtered
             measured, quads = True, {"left": left, "right": right}
             target.seen_since = target.seen_since if target.history[-1].measured else head.t
@@ -199,7 +177,7 @@ def follow(target: Target, pair: Pair, expected: Expected, hidden: float) -> Non
 
 def alike(target: Target, pair: Pair, quad: Array) -> bool:
     """Whether what a left quad (4, 2) shows looks as the target did."""
-    return unlike(target.looks, looks(pair.pictures["left"], quad)) < ALIKE
+    return unlike(target.colours, looks(pair.pictures["left"], quad)) < ALIKE
 
 
 def found_again(target: Target, pair: Pair, middle: Array, depth: float) -> Array | None:
@@ -222,16 +200,6 @@ def found_again(target: Target, pair: Pair, middle: Array, depth: float) -> Arra
     return moved
 
 
-def _across(rig: StereoRig, pair: Pair, left: Array, right: Array, reach: float) -> tuple[Array, Array] | None:
-    """The right quad (4, 2) of a left one, near `right` on the epipolar line, and the variances (2,) of its place."""
-    ray = np.append(left.mean(axis=0), 1.0) @ np.linalg.inv(rig.left.K).T
-    far, near = projected(rig.right.K, in_right(rig, ray * np.array([[200.0], [100.0]])))
-    along = near - far
-    if not np.isfinite(along).all() or np.linalg.norm(along) < 1e-9:
-        return None
-    return region_shift(pair.pictures, left, right, along / np.linalg.norm(along), reach)
-
-
 def _look(target: Target, pair: Pair, expected: Expected) -> tuple[Array, Array, Array, Alignment] | None:
     """Left and right quads (4, 2) where the target is seen, the noise (4, 4) of both middles, and the fit; or None."""
     left = expected.quads["left"]
@@ -243,70 +211,13 @@ def _look(target: Target, pair: Pair, expected: Expected) -> tuple[Array, Array,
         return None
     right = expected.quads["right"] + (moved - expected.quads["left"])
     disparity = abs(float(np.mean(moved[:, 0] - right[:, 0])))
-    across = _across(target.rig, pair, moved, right, REACH + 3 * min(expected.doubt, 0.1) * disparity)
-    if across is None:
+    opposite = across(target.rig, pair, moved, right, REACH + 3 * min(expected.doubt, 0.1) * disparity)
+    if opposite is None:
         return None
     R = np.zeros((4, 4))
     R[:2, :2] = TRUST * found.cov[:2, :2]
-    R[2:, 2:] = np.diag(across[1])
-    return moved, across[0], R, found
-
-
-def _measurement(target: Target, left: Array, right: Array, noise: Array, flow: Array | None) -> tuple[Array, Array]:
-    """z (5,): flow (2,) px a frame, disparity, middle (2,) px; and its noise (5, 5). Jia 2008, eq. 17."""
-    settings = target.config.measure
-    u, v = left.mean(axis=0)
-    z = np.array([0.0, 0.0, u - right[:, 0].mean(), u, v])
-    R = np.zeros((5, 5))
-    R[2, 2] = noise[2, 2] + settings.disparity_sigma**2
-    R[3:, 3:] = noise[:2, :2] + settings.place_sigma**2 * np.eye(2)
-    mean = None if flow is None else _mean_flow(left, flow)  # what runs out of the picture has no flow
-    if mean is None:
-        R[:2, :2] = 1e6 * np.eye(2)
-    else:
-        z[:2] = mean
-        R[:2, :2] = settings.flow_sigma**2 * np.eye(2)
-    return z, R
-
-
-def _mean_flow(quad: Array, flow: Array) -> Array | None:
-    """The median flow (2,) px inside the inner half of a quad; None at the picture's edge."""
-    if not patches.inside(quad, (flow.shape[1], flow.shape[0]), FLOW_RIM):
-        return None
-    middle, half = quad.mean(axis=0), np.array(patches.side(quad)) / 4
-    low, top = np.maximum(np.rint(middle - half), 0).astype(int), np.rint(middle + half).astype(int) + 1
-    part = flow[low[1] : top[1], low[0] : top[0]].reshape(-1, 2)
-    return np.median(part, axis=0) if len(part) else None
-
-
-def expected(rig: StereoRig, states: Array, head: Head, before: Head) -> Array:
-    """What would be measured (..., 5) of common states (..., 12), by geometry alone. Jia 2008, eq. 17.
-
-    The flow is that of a point that was a step of its velocity back, seen from where the camera then was: its turning
-    and its way are in it.
-    """
-    dt = head.t - before.t
-    here = head.inside(states[..., P])
-    past = before.inside(states[..., P] - states[..., V] * dt)
-    left = projected(rig.left.K, here)
-    right = projected(rig.right.K, in_right(rig, here))
-    flow = left - projected(rig.left.K, past)
-    return np.concatenate([flow, left[..., :1] - right[..., :1], left], axis=-1)
-
-
-def _updated(target: Target, step: Step, z: Array, R: Array, head: Head, before: Head) -> tuple[Step, float] | None:
-    """The step after the measurement, and how far that was off; None where no model can believe it."""
-    change = STEP * np.eye(6, SIZE)
-    tried = step.predicted.mean[:, None] + np.concatenate([np.zeros((1, SIZE)), change, -change])  # (r, 13, 12)
-    h = expected(target.rig, tried, head, before)
-    if not np.isfinite(h).all():
-        return None
-    J = np.zeros((len(h), len(z), SIZE))
-    J[:, :, :6] = np.swapaxes(h[:, 1:7] - h[:, 7:], 1, 2) / (2 * STEP)
-    updated, innovation = imm.update(step, z - h[:, 0], J, R)
-    if innovation.nis.min() > gate_size(len(z), GATE):
-        return None
-    return updated, float(np.exp(updated.filtered.log_mu) @ innovation.nis)
+    R[2:, 2:] = np.diag(opposite[1])
+    return moved, opposite[0], R, found
 
 
 def _refresh(target: Target, pair: Pair, left: Array, found: Alignment) -> None:
@@ -314,6 +225,6 @@ def _refresh(target: Target, pair: Pair, left: Array, found: Alignment) -> None:
     place = pair.head.inside(target.belief.mean[P])
     size = np.array(patches.side(left)) * place[2] / np.diag(target.rig.left.K)[:2]
     target.size = target.size + 0.1 * (np.clip(size, 0.8 * target.size, 1.25 * target.size) - target.size)
-    target.looks = KEEP_LOOKS * target.looks + (1 - KEEP_LOOKS) * looks(pair.pictures["left"], left)
+    target.colours = KEEP_LOOKS * target.colours + (1 - KEEP_LOOKS) * looks(pair.pictures["left"], left)
     if found.correlation < target.config.measure.fresh and pair.head.t - target.seen_since > SETTLED_S:
         target.sought = patches.holding(pair.levels, left)

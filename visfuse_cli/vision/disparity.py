@@ -21,8 +21,14 @@ SMALLEST = 9.0  # px: side of a cell
 MOST = 12  # samples along a side of a cell
 STEP = 0.5  # px between the shifts that are tried
 ROUNDS = 2  # by which the best of them is refined to parts of a pixel
+NEAR = 2.5  # times the cells' scatter around their median: what is further off is something else
 BACK_PX = 1.0  # by which looking back from the right view may miss
 FLOOR = 0.03  # px, and the deviation is no less
+# What parts of a pixel are told by: brightness, and blue and red beside it. Compressed footage has these at half size.
+BRIGHT, HUE = np.array([0.114, 0.587, 0.299], np.float32), 0.05
+FINE = np.stack(
+    [BRIGHT, HUE * (np.eye(3, dtype=np.float32)[0] - BRIGHT), HUE * (np.eye(3, dtype=np.float32)[2] - BRIGHT)]
+)
 CLEAR = (18.0, 0.75)  # a match is one up to so many grey levels a sample, and up to so much of the middle shift's
 VAGUE = (45.0, 0.93)  # where background is part of the cells
 
@@ -65,10 +71,18 @@ def _shift(
     fits &= np.abs(np.nan_to_num(back, nan=np.inf)) < BACK_PX
     if np.count_nonzero(fits) < max(min(2, len(cells)), len(cells) / 3):
         return None
-    middle = float(np.median(found[fits]))
-    scatter = 1.4826 * float(np.median(np.abs(found[fits] - middle)))
-    variance = ((1.25 * scatter) ** 2 + float(np.median(spread[fits]))) / np.count_nonzero(fits)
+    middle, variance = _agreed(found[fits], spread[fits])
     return right + middle * along, (variance + FLOOR**2) * along**2 + 0.05**2
+
+
+def _agreed(found: Array, variance: Array) -> tuple[float, float]:
+    """One shift (px) of those of cells (c,) with their variances, and its own: the mean of those near the median."""
+    middle = np.median(found)
+    scatter = 1.4826 * float(np.median(np.abs(found - middle)))
+    near = np.abs(found - middle) <= max(NEAR * scatter, FLOOR)
+    weight = near / (variance + scatter**2 + FLOOR**2)
+    mean = float(weight @ found / weight.sum())
+    return mean, max(1 / float(weight.sum()), float(weight**2 @ (found - mean) ** 2 / weight.sum() ** 2))
 
 
 def _cells(quad: Array, share: float, count: list[int]) -> Array:
@@ -108,7 +122,7 @@ def _best(
     found = shift[best].copy()
     for _ in range(ROUNDS):
         tried = _seen(picture, at + (found + np.array([[-0.5], [0.0], [0.5]]))[..., None, None] * along)
-        slope, off = tried[2] - tried[0], tried[1] - wanted
+        slope, off = (tried[2] - tried[0]) @ FINE.T, (tried[1] - wanted) @ FINE.T
         off = off - off.mean(axis=1, keepdims=True)
         slope = slope - slope.mean(axis=1, keepdims=True)
         steep = np.sum(slope**2, axis=(1, 2)) + 1e-6

@@ -26,10 +26,11 @@ from visfuse_cli.files.video import VideoSource
 from visfuse_cli.files.video_writer import VideoWriter
 from visfuse_cli.moving.annotate import Drawn, inset, together
 from visfuse_cli.moving.conclude import conclude, track_record
+from visfuse_cli.moving.head import Head
 from visfuse_cli.moving.journey import journey
 from visfuse_cli.moving.models import INDEX
 from visfuse_cli.moving.settings import ImmConfig
-from visfuse_cli.moving.target import Head, Target
+from visfuse_cli.moving.target import Target
 from visfuse_cli.moving.tracker import Tracker
 from visfuse_cli.pipeline import Run
 from visfuse_cli.records import Array, FrameSet, Image, Lens, RunRequest, StereoRig
