@@ -15,7 +15,7 @@ from visfuse_cli.records import Gaussian, GivenTarget, Lens, StereoRig
 SIZE = (100, 80)
 
 
-@dataclass
+@dataclass(eq=False)
 class Thing:
     id: int
     box: np.ndarray | None

@@ -54,7 +54,7 @@ class Expected:
         return box_of(self.quad) if np.isfinite(self.quad).all() else None
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, eq=False)
 class Target:
     """A target that is followed; `size` (2,) m of what is seen of it; a step of the bank for each look, once begun."""
 

@@ -152,8 +152,9 @@ class Pursuit(ABC, Generic[T, V, W, F]):
 
     def _forgotten(self, t: float) -> list[T]:
         """Those that nobody waits for any more."""
-        over = [each for each in self._gone if t - each.last_seen > self._config.life.memory_s]
-        self._gone = [each for each in self._gone if each not in over]
+        memory = self._config.life.memory_s
+        over = [each for each in self._gone if t - each.last_seen > memory]
+        self._gone = [each for each in self._gone if t - each.last_seen <= memory]
         return over
 
     def _over(self, target: T, t: float) -> bool:

@@ -40,7 +40,7 @@ class Seen:
     ahead: Gaussian | None  # the common belief a latency later
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, eq=False)
 class Target:
     """A target that is followed; `size` (2,) m of its visible surface, `colours` (bands, 3) what it looks like.
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import takewhile
 
 import numpy as np
 
@@ -92,7 +93,7 @@ class Tracker(Pursuit[Target, Pair, Expected, Found]):
         """Whether a target that was found has for some time been where an older one is, and gone as that goes."""
         own, belief = target.box, target.belief
         near = False
-        for other in self._followed[: self._followed.index(target)]:
+        for other in takewhile(lambda each: each is not target, self._followed):
             box, there = other.box, other.belief
             if own is None or box is None or covered(own, _grown(box)) < TWINS_SHARE:
                 continue
