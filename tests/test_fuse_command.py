@@ -29,7 +29,7 @@ def run(*args):
 
 @pytest.fixture(scope="module")
 def yard():
-    return crossing(21, seconds=7.0, people=2, size=(480, 360), fps=Fraction(15))
+    return crossing(21, seconds=7.0, people=2, size=(384, 288), fps=Fraction(12))
 
 
 @pytest.fixture(scope="module")
@@ -80,7 +80,7 @@ def test_everybody_is_found_once_and_located_to_a_few_centimetres(scene, result)
     assert summary["people"] == 2
     off = errors(scene, out)
     for rows in off.values():
-        assert len(rows) > 0.93 * 7 * 15
+        assert len(rows) > 0.93 * 7 * 12
         assert np.sqrt(np.mean(np.sum(rows[:, :3] ** 2, axis=1))) < 0.08
         assert np.abs(rows[:, :3]).max() < 0.3  # also where they cross: nobody changes hands
 
@@ -191,7 +191,7 @@ def boxes(yard, scene, result, tmp_path_factory):
 @pytest.mark.parametrize("method", ["closed-loop", "naive", "kim", "covariance-intersection", "central"])
 def test_boxes_alone_are_enough_whatever_the_way_of_fusion(scene, boxes, tmp_path, method):
     out = tmp_path / "run"
-    done = run(boxes, "--out", out, "--no-report", "--set", "video.fps=15", "--set", f"fusion.method={method}")
+    done = run(boxes, "--out", out, "--no-report", "--set", "video.fps=12", "--set", f"fusion.method={method}")
     assert done.returncode == 0, done.stderr
     assert not list(out.glob("annotated*"))
     for rows in errors(scene, out).values():
@@ -309,5 +309,5 @@ def test_footage_of_another_size_is_refused(scene, tmp_path):
     folder = tmp_path / "scene"
     shutil.copytree(scene, folder)
     text = (folder / "calibration.toml").read_text(encoding="utf-8")
-    (folder / "calibration.toml").write_text(text.replace("[480, 360]", "[640, 480]"), encoding="utf-8")
-    refused(run(folder, "--out", tmp_path / "run"), 3, "480x360, but camera 'cam1' was calibrated for 640x480")
+    (folder / "calibration.toml").write_text(text.replace("[384, 288]", "[640, 480]"), encoding="utf-8")
+    refused(run(folder, "--out", tmp_path / "run"), 3, "384x288, but camera 'cam1' was calibrated for 640x480")
