@@ -13,6 +13,7 @@ from visfuse_cli.maths.multiview import project
 from visfuse_cli.records import Array, Gaussian
 
 LEAST = 40  # sightings of a camera that make a finding
+FIRST, OFTEN = 150, 40  # clear sights a camera before cameras are first judged, and from then on each time
 FAR_M = 0.25  # m from which on a camera is said to stand elsewhere
 BLIND = 0.5  # share of clear sights without use from which on it is
 LATE_S = 0.06  # s from which on a clock is said to be off
@@ -43,6 +44,7 @@ class Audit:
         self._A, self._b = np.zeros((cameras, 3, 3)), np.zeros((cameras, 3))
         self._square, self._n = np.zeros(cameras), np.zeros(cameras, dtype=int)
         self._scale = np.zeros(cameras)
+        self._due = FIRST * cameras
         self._clear, self._used = np.zeros(cameras, dtype=int), np.zeros(cameras, dtype=int)
 
     def take(self, sights: Sights, P: Array, prior: Gaussian) -> None:
@@ -68,6 +70,13 @@ class Audit:
         self._clear += np.count_nonzero(clear, axis=0)
         self._used += np.count_nonzero(clear & used, axis=0)
 
+    def due(self) -> bool:
+        """Whether enough was taken in since it was last said so to look at the findings again."""
+        if self._clear.sum() < self._due:
+            return False
+        self._due = int(self._clear.sum()) + OFTEN * len(self._n)
+        return True
+
     def findings(self, zoom: Array) -> list[Finding]:
         """What was found of each camera; `zoom` (C,) pixels of the footage per pixel that was measured in."""
         found = []
@@ -87,18 +96,31 @@ class Audit:
         return found
 
 
+def misfits(findings: list[Finding]) -> list[int]:
+    """The cameras that do not stand where the calibration says, beside two others or more that do."""
+    known = np.array([each.sightings >= LEAST for each in findings])
+    found = []
+    for c, each in enumerate(findings):
+        others = np.flatnonzero(known & (np.arange(len(findings)) != c))
+        if len(others) < 2:
+            continue
+        usual = float(np.median([findings[o].shift_m for o in others]))
+        blind = float(np.median([findings[o].unused for o in others]))
+        if (known[c] and each.shift_m > max(FAR_M, 4 * usual)) or each.unused > max(BLIND, 2.5 * blind):
+            found.append(c)
+    return found
+
+
 def complaints(names: list[str], findings: list[Finding], interval_s: float) -> list[str]:
     """What to warn of: cameras that do not stand where the calibration says, or whose clock is off."""
     late = np.array([each.late for each in findings])
     known = np.array([each.sightings >= LEAST for each in findings])
-    said = []
+    said, wrong = [], misfits(findings)
     for c, each in enumerate(findings):
         others = known & (np.arange(len(names)) != c)
         if np.count_nonzero(others) < 2:
             continue
-        usual = float(np.median([findings[o].shift_m for o in np.flatnonzero(others)]))
-        blind = float(np.median([findings[o].unused for o in np.flatnonzero(others)]))
-        if (known[c] and each.shift_m > max(FAR_M, 4 * usual)) or each.unused > max(BLIND, 2.5 * blind):
+        if c in wrong:
             said.append(
                 f"camera '{names[c]}' does not fit the others: people stand {np.linalg.norm(each.shift):.0f} px "
                 f"({each.shift_m:.2f} m) from where its calibration puts them, and {each.unused:.0%} of its clear "

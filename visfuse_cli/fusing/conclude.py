@@ -65,7 +65,7 @@ def conclude(person: Person, P: Array, config: FuseConfig) -> Path | None:
     rows, seen = person.history.rows, seen[: last[-1] + 1]
     t = np.array(person.history.t)
     pairs = np.flatnonzero(np.count_nonzero(seen, axis=1) >= 2)
-    if t[pairs[-1]] - t[pairs[0]] < config.life.min_duration_s - 1e-9:
+    if not len(pairs) or t[pairs[-1]] - t[pairs[0]] < config.life.min_duration_s - 1e-9:
         return None
     frame = np.array(person.history.frame)
     told = (seen.any(axis=1) | (np.array(person.history.denied) < DENIED)) & (frame >= 0)

@@ -57,6 +57,11 @@ class History:
         """Say of each camera's sightings that they were made later than was thought, by `late` (C,) s."""
         np.frombuffer(self._rows).reshape(-1, self._cameras, COLUMNS)[:, :, DT] += late
 
+    def forget(self, cameras: list[int]) -> None:
+        """Take back what cameras saw that are not to be believed."""
+        if cameras:
+            np.frombuffer(self._rows).reshape(-1, self._cameras, COLUMNS)[:, cameras] = np.nan
+
     def cut(self, length: int) -> None:
         """Forget what came after the first `length` instants."""
         del self.frame[length:], self.t[length:], self.denied[length:], self._state[6 * length :]

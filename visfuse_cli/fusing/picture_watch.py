@@ -67,6 +67,7 @@ class PictureWatch:
         self._occupancy = Occupancy(P, sizes, config.person.height)
         self._shadows = GroundShadows(P, sizes, self._occupancy.places) if len(self._occupancy.places) else None
         self._dt: dict[int, float] = {}
+        self._distrusted: list[int] = []
 
     def settle(self, cameras: list[int]) -> None:
         """Tell people from shadows in the latest pictures of `cameras`, by what they say of the same ground."""
@@ -86,7 +87,7 @@ class PictureWatch:
 
     def look(self, dt: dict[int, float], tracker: Tracker) -> list[dict[int, Sighting]]:
         """Sightings of everybody followed, by the cameras in `dt` (s), whose pictures were looked at."""
-        self._dt = dt
+        self._dt, self._distrusted = dt, tracker.distrusted
         expected = self._expected(tracker.people)
         there = self._backed(tracker.beliefs, [person.body for person in tracker.people])
         return [self._sightings(expected, there[k], k, person.body) for k, person in enumerate(tracker.people)]
@@ -151,7 +152,8 @@ class PictureWatch:
             if measured is not None:
                 z, R, lever = measured
                 found[camera] = Sighting(z, R, eye.straight.shown(seen.rim), dt, lever, float(lever @ assumed))
-                learn_body(body, assumed, there, who, seen)
+                if camera not in self._distrusted:
+                    learn_body(body, assumed, there, who, seen)
         return found
 
     def _newcomer(self, place: Array, people: list[Person]) -> Newcomer | None:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from visfuse_cli.fusing.audit import Audit
+from visfuse_cli.fusing.audit import Audit, misfits
 from visfuse_cli.fusing.body import usual_body
 from visfuse_cli.fusing.estimate import Sights, at_one_time, consistent, fuse, stand
 from visfuse_cli.fusing.person import History, Person
@@ -80,6 +80,7 @@ class Tracker:
         self._next_id = 1
         self._dt = 0.0  # s from the instant before the latest
         self.audit = Audit(len(P))
+        self.distrusted: list[int] = []  # cameras that do not stand where they are said to, as far as is known now
 
     @property
     def beliefs(self) -> Gaussian:
@@ -113,6 +114,7 @@ class Tracker:
         settled = np.array([person.confirmed for person in self.people])
         self.audit.take(sights.of(settled[sights.owner]), self.P, prior)
         good = consistent(sights, self.P, prior.mean[:, :3], self.config.sight.gate)
+        good &= ~np.isin(sights.camera, self.distrusted)
         good &= self._expected(sights.of(good), good, prior)
         used = sights.of(good)
         banks = [person.bank for person in self.people]
@@ -196,6 +198,8 @@ class Tracker:
         for k in settled:
             used[k, list(self.people[k].last)] = True
         self.audit.sights(clear[settled], used[settled])
+        if self.audit.due():
+            self.distrusted = misfits(self.audit.findings(np.ones(len(self.P))))
 
     def end(self, t: float, in_view: NDArray[np.intp]) -> list[Person]:
         """Let go whom nobody has seen for long, or who left; `in_view` (T,) counts the cameras that hold each."""
@@ -217,6 +221,8 @@ class Tracker:
                 self.people.remove(person)
                 ended.append(person)
         ended += self._twins(t)
+        for person in ended:
+            person.history.forget(self.distrusted)
         return ended
 
     def _twins(self, t: float) -> list[Person]:
@@ -237,6 +243,7 @@ class Tracker:
         """Everybody who is still followed as the footage ends."""
         people, self.people = self.people, []
         for person in people:
+            person.history.forget(self.distrusted)
             person.ended_by = "end of footage"
         return people
 
