@@ -198,6 +198,29 @@ def test_boxes_alone_are_enough_whatever_the_way_of_fusion(scene, boxes, tmp_pat
         assert np.sqrt(np.mean(np.sum(rows[:, :3] ** 2, axis=1))) < 0.12
 
 
+def test_one_camera_alone_follows_on_and_says_how_doubtfully(scene, boxes, tmp_path):
+    last = 50  # frame after which the others are blind
+    for name in ("cam1", "cam2", "cam3", "cam4"):
+        rows = (boxes / f"{name}.txt").read_text(encoding="utf-8").splitlines()
+        kept = [row for row in rows if name == "cam1" or int(row.split(",")[0]) <= last]
+        (tmp_path / f"{name}.txt").write_text("\n".join(kept) + "\n", encoding="utf-8")
+    shutil.copy(boxes / "calibration.toml", tmp_path)
+    done = run(tmp_path, "--out", tmp_path / "run", "--no-report", "--set", "video.fps=12", "--set", "life.max_doubt=9")
+    assert done.returncode == 0, done.stderr
+    truth, alone = truth_of(scene), 0
+    for track in json.loads((tmp_path / "run" / "tracks.json").read_text(encoding="utf-8"))["tracks"]:
+        states = [state for state in track["states"] if state["frame"] >= last + 6 and list(state["box"]) == ["cam1"]]
+        alone += len(states)
+        for state in states:
+            who = min((1, 2), key=lambda k: np.linalg.norm(truth[state["frame"], k][:3] - state["position"]))
+            off = np.array(state["position"]) - truth[state["frame"], who][:3]
+            sigma = np.sqrt(np.diag(state["covariance"])[:3])
+            assert np.linalg.norm(off) < 0.5
+            assert np.all(np.abs(off) < 4 * sigma)
+            assert np.linalg.norm(sigma[:2]) > 0.06  # more than what several cameras leave
+    assert alone > 20
+
+
 @pytest.mark.skipif(not SQUARE.is_dir(), reason="the recordings lie beside the project; they are not here")
 def test_a_real_crowd_of_boxes(tmp_path):
     done = run(SQUARE, "--config", "crowd", "--set", "video.fps=2", "--out", tmp_path / "run", "--json", "--no-report")

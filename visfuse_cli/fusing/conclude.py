@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from visfuse_cli.fusing.body import LEVEL_M
+from visfuse_cli.fusing.doubt import stated
 from visfuse_cli.fusing.estimate import Sights, at_one_time, fuse, pair_up, stand
 from visfuse_cli.fusing.noise import disagreement, restlessness
 from visfuse_cli.fusing.person import ASSUMED, BOX, DT, LEVER, VARIANCE, Person, Z
@@ -23,9 +23,6 @@ from visfuse_cli.maths.smoothing import rauch_tung_striebel
 from visfuse_cli.records import Array, Gaussian
 
 DENIED = 1  # camera or more with a clear sight that speak against a prediction
-BODY_SIGMA = 0.0035  # m, times the root of the noise found: what cameras err alike, as by feet that point ahead
-UPRIGHT_SIGMA = 0.005  # m: heads are not as round as they are taken to be, nor is the ground as flat
-EDGE_PX = 0.2  # px: what half of the height is uncertain by, as silhouettes end between pixels
 START_DOUBT = 2.0  # times the deviations a track began with
 
 
@@ -82,12 +79,9 @@ def conclude(person: Person, P: Array, config: FuseConfig) -> Path | None:
         sigma_a = restlessness(*places, t, config.filter, person.start)
         belief, nis = _filtered(person, sights, P, t, state, config, noise, sigma_a)
         pixels, J = project(P[sights.camera], belief.mean[sights.owner, :3])
-    cov, centroid = belief.cov.copy(), config.fusion.point == "centroid"
-    cov[:, :3, :3] += BODY_SIGMA**2 * noise * np.eye(3) + _by_body(
-        sights, J, lever, person.body.ends.cov, len(t), centroid
-    )
-    cov[:, 2, 2] += UPRIGHT_SIGMA**2 + (EDGE_PX / float(np.median(np.linalg.norm(J[:, :, 2], axis=1)))) ** 2
-    belief = Gaussian(belief.mean, cov)
+    centroid = config.fusion.point == "centroid"
+    belief = stated(belief, sights, J, lever, person.body.ends.cov, noise, centroid)
+    told &= (np.count_nonzero(seen, axis=1) != 1) | (_aside(belief) < config.life.max_doubt)
     residual = np.full((*seen.shape, 2), np.nan)
     residual[sights.owner, sights.camera] = sights.z - pixels
     return Path(
@@ -109,6 +103,11 @@ def conclude(person: Person, P: Array, config: FuseConfig) -> Path | None:
     )
 
 
+def _aside(belief: Gaussian) -> Array:
+    """The largest deviation (T,) m along the ground of beliefs (T, 6)."""
+    return np.asarray(np.sqrt(np.linalg.eigvalsh(belief.cov[:, :2, :2])[:, -1]))
+
+
 def _sights(rows: Array, seen: NDArray[np.bool_], state: Array, P: Array, ends: Array) -> tuple[Sights, Array]:
     """All sightings of a track, the instants as owners, brought to the instants of the sets; and their levers (M, 3).
 
@@ -123,20 +122,6 @@ def _sights(rows: Array, seen: NDArray[np.bool_], state: Array, P: Array, ends: 
     R = np.stack([np.stack([a, b], axis=-1), np.stack([b, c], axis=-1)], axis=-2)
     sights = Sights(owner, camera, z, R, own[:, DT])
     return at_one_time(sights, P, Gaussian(state, np.zeros((len(state), 6, 6)))), lever
-
-
-def _by_body(sights: Sights, J: Array, lever: Array, ends: Array, count: int, centroid: bool) -> Array:
-    """Covariances (count, 3, 3) of the positions that come from the doubt of the body's ends (3, 3): one for all."""
-    J_W = np.swapaxes(J, -1, -2) @ np.linalg.inv(sights.R)
-    information, push = np.tile(np.eye(3), (count, 1, 1)), np.zeros((count, 3, 3))
-    np.add.at(information, sights.owner, J_W @ J)
-    np.add.at(push, sights.owner, (J_W @ J[:, :, 2:]) * lever[:, None])
-    number = np.bincount(sights.owner, minlength=count)
-    information[number == 1, 2, 2] += LEVEL_M**-2  # one camera alone, and the height as it is known
-    push[number == 1, 2, 0] += 0.5 * centroid * LEVEL_M**-2
-    moved = np.asarray(np.linalg.solve(information, push), dtype=float)
-    moved[number == 0] = moved[number > 0].mean(axis=0)
-    return moved @ ends @ np.swapaxes(moved, -1, -2)
 
 
 def _filtered(

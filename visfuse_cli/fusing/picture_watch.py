@@ -195,7 +195,8 @@ class PictureWatch:
         body = usual_body(new.height, person.height_sigma, person.width, PRIOR_LOOKS)
         belief = _stacked([beginning(new.place, self._config)])
         expected = expect(self._P, belief, [body], np.zeros(1, dtype=np.intp), self._config)
-        return {camera: self._widened(expected[camera].box)[0] for camera in self._dt}
+        boxes = {camera: self._widened(expected[camera].box) for camera in self._dt}
+        return {camera: box[0] for camera, box in boxes.items() if len(box)}  # none where it is behind the camera
 
     @staticmethod
     def _widened(boxes: Array) -> Array:

@@ -102,6 +102,9 @@ class LifeSettings(Section):
         40, ge=1, le=100000, description="times that cameras with a clear sight of the place may not see somebody"
     )
     min_duration_s: float = Field(0.8, ge=0, le=600, description="s: a track that was measured for less is dropped")
+    max_doubt: float = Field(
+        0.3, gt=0, le=100, description="m: deviation beyond which no place is told of who is seen by one camera alone"
+    )
     nearest: float = Field(0.25, gt=0, le=5, description="m: two people cannot stand nearer to each other")
 
 
