@@ -20,7 +20,7 @@ def stated(
     """Beliefs (T, 6) with all that is in doubt of the positions.
 
     J (M, 2, 3) px/m and levers (M, 3) of the sightings (M); `ends` (3, 3) m^2 the covariance of the body's ends;
-    `noise` of measurements as a share of the nominal one; `centroid`: the middle of the height is tracked, not the foot.
+    `noise` of measurements as a share of the nominal one; `centroid`: the middle of the height is tracked.
     """
     count = len(belief.mean)
     J_W = np.swapaxes(J, -1, -2) @ np.linalg.inv(sights.R)

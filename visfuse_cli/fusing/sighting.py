@@ -20,7 +20,6 @@ LOOSE_M = 0.35  # how far from the prediction a person's pixels are looked for, 
 WHOLE = 0.4  # share of a person that must be seen for the body's lengths to be learnt
 POSTURE_M = 0.03  # how much the height comes and goes
 ENDS_M = 0.08  # noise of one look at where head or feet end
-UNDER_M = 0.12  # what reaches farther below the ground than this, the doubt of the place aside, is a reflection
 STRANGE_M = 0.5  # what ends farther from where it is expected is something else
 
 
@@ -70,7 +69,7 @@ def tracked_point(
     u = _sideways(seen, body.half.mean * scale, limb, BREADTH_M * scale / 2)
     height_sigma = float(np.hypot(np.sqrt(body.ends.cov[0, 0]), POSTURE_M))
     foot_only = config.fusion.point == "foot"
-    ends = _ends(seen, expected.box[who], UNDER_M * scale + float(expected.reach[who]))
+    ends = _ends(seen, expected.box[who])
     v = _upright(seen, expected.box[who], ends, end, height_sigma * scale, foot_only)
     if u is None and v is None:
         return None
@@ -94,11 +93,9 @@ def _sideways(seen: Sides, half: float, sigma: float, half_sigma: float) -> tupl
     return None
 
 
-def _ends(seen: Sides, box: Array, under: float) -> tuple[bool, bool]:
-    """Whether top and bottom tell anything; what reaches more than `under` px too low is a reflection."""
+def _ends(seen: Sides, box: Array) -> tuple[bool, bool]:
+    """Whether top and bottom tell anything."""
     top, bottom = float(seen.box[1] - box[1]), float(seen.box[3] - box[3])
-    if bottom > under:
-        return seen.top, False
     if seen.top and seen.bottom and abs(bottom - top) > TALLER * (box[3] - box[1]):
         # with a wrong height one end is something else's
         return (False, True) if abs(top) > abs(bottom) else (True, False)
@@ -142,5 +139,5 @@ def learn_body(body: Body, assumed: Array, expected: Expected, who: int, seen: S
     height, head, feet = assumed
     if seen.top and abs(up[1]) < STRANGE_M:
         body.ends.learn(level + height + slope * head + up[1], np.array([1.0, slope, 0.0]), ENDS_M)
-    if seen.bottom and abs(up[3]) < (STRANGE_M if up[3] > 0 else UNDER_M + float(expected.reach[who]) / scale):
+    if seen.bottom and abs(up[3]) < STRANGE_M:
         body.ends.learn(-(level - slope * feet + up[3]), np.array([0.0, 0.0, slope]), ENDS_M)
