@@ -13,7 +13,7 @@ from visfuse_cli.fusing.tracker import at_rest, held_motion
 from visfuse_cli.maths import gaussian
 from visfuse_cli.records import Array, Gaussian
 
-BATCH_S = 0.75  # s over which errors are summed: longer than a step, and than what the smoother looks around
+BATCH_S = 0.5  # s over which errors are summed: a step, and about what the smoother looks around
 PRIOR_BATCHES = 6.0  # batches that the usual noise counts for
 USUAL = 1.0  # times the nominal variance
 LIMITS = (0.05, 100.0)
