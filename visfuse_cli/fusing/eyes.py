@@ -162,7 +162,8 @@ class PictureEyes:
 
     def learn(self, t: float, tracker: Tracker) -> None:
         """Let the backgrounds adapt where nobody is."""
-        self._watch.learn(t, tracker)
+        boxes = self._watch.followed(tracker)
+        list(self._pool.map(lambda camera: self._cameras[camera].learn(t, boxes[camera]), self._dt))
 
 
 def _frames(names: list[str], instant: FrameSet) -> dict[int, Frame]:

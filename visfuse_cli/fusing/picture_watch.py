@@ -115,11 +115,10 @@ class PictureWatch:
             tried.append(place)
         return found
 
-    def learn(self, t: float, tracker: Tracker) -> None:
-        """Let the backgrounds adapt where nobody is."""
+    def followed(self, tracker: Tracker) -> dict[int, Array]:
+        """Boxes [u0, v0, u1, v1] (n, 4) px, with a margin, of everybody followed, by camera."""
         expected = self._expected(tracker.people)
-        for camera in self._dt:
-            self._cameras[camera].learn(t, self._widened(expected[camera].box))
+        return {camera: self._widened(expected[camera].box) for camera in self._dt}
 
     def _expected(self, people: list[Person]) -> list[Expected]:
         return expect(

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from visfuse_cli.maths.gaussian import mahalanobis, symmetrise
 from visfuse_cli.records import Array, Gaussian
@@ -17,7 +17,7 @@ FULL_RANK = 1e-6  # share of the largest eigenvalue, above rounding
 
 def verdict(ratio: float, freedom: float) -> dict[str, Any]:
     """A mean normalised square per degree of freedom, against its chi-square band over `freedom` degrees."""
-    low, high = (float(chi2.ppf(p, freedom)) / freedom for p in ((1 - BAND) / 2, (1 + BAND) / 2))
+    low, high = (float(chdtri(freedom, above)) / freedom for above in ((1 + BAND) / 2, (1 - BAND) / 2))
     word = "consistent" if low <= ratio <= high else ("cautious" if ratio < low else "too sure of itself")
     return {"per_degree_of_freedom": ratio, "band": [low, high], "verdict": word}
 

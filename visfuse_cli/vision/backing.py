@@ -53,20 +53,18 @@ def _look(
     P: Array, mask: Image, outside: Image, cells: Array
 ) -> tuple[NDArray[np.intp], NDArray[np.bool_], NDArray[np.bool_]]:
     """The boxes (T, N, 4) px that cells (T, N, 3) fill in one picture, whether it holds them, and what moves there."""
-    size = np.array(mask.shape[::-1])
-    pixels, _ = multiview.project(P, cells)
+    wide, high = mask.shape[1], mask.shape[0]
+    x, y, depth = np.moveaxis(cells @ P[:, :3].T + P[:, 3], -1, 0)
     with np.errstate(invalid="ignore", divide="ignore"):
-        half = CORNER * STEP_M * np.linalg.norm(P[0, :3]) / multiview.depths(P, cells)
-        held = np.isfinite(pixels).all(axis=-1) & np.all((pixels > 0) & (pixels < size - 1), axis=-1)
-    middle, half = np.where(held[..., None], pixels, 0), np.where(held, half, 0)[..., None]
-    u, v = np.moveaxis(middle.astype(np.intp), -1, 0)
-    held &= outside[v, u] == 0
-    low, high = np.clip(np.floor(middle - half), 0, size), np.clip(np.ceil(middle + half) + 1, 0, size)
-    box = np.concatenate([low, high], axis=-1).astype(np.intp)
-    u0, v0, u1, v1 = np.moveaxis(box, -1, 0)
+        u, v, half = x / depth, y / depth, CORNER * STEP_M * np.linalg.norm(P[0, :3]) / depth
+        held = (depth > multiview.NEAREST) & (u > 0) & (u < wide - 1) & (v > 0) & (v < high - 1)
+    u, v, half = (np.where(held, each, 0) for each in (u, v, half))
+    held &= outside[v.astype(np.intp), u.astype(np.intp)] == 0
+    u0, v0 = (np.maximum(each - half, 0).astype(np.intp) for each in (u, v))
+    u1, v1 = np.minimum(u + half + 2, wide).astype(np.intp), np.minimum(v + half + 2, high).astype(np.intp)
     summed = cv2.integral(mask)
     count = summed[v1, u1] - summed[v0, u1] - summed[v1, u0] + summed[v0, u0]
-    return box, held, held & (count > 0)
+    return np.stack([u0, v0, u1, v1], axis=-1), held, held & (count > 0)
 
 
 def covered(boxes: Array, window: tuple[int, int, int, int]) -> NDArray[np.bool_]:

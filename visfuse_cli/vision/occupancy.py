@@ -12,6 +12,7 @@ from visfuse_cli.records import Array, Image
 STEP_M = 0.15
 FARTHEST_M = 18.0  # m from the cameras' middle
 SMALLEST_PX = 24  # of a person's height, to be found
+LEAST_PX = 50  # pixels that the trunk of the smallest fills
 TRUNK_M = 0.36  # width of the box that a person should fill
 FILLED, EXPECTED = 0.42, 0.35  # share of that box that moves where somebody stands, and what speaks for nobody
 MOST = 60_000  # places; a larger area is searched in larger steps
@@ -43,7 +44,8 @@ class Occupancy:
 
     def likeliest(self, masks: dict[int, Image], tried: list[Array], apart: float) -> Array | None:
         """The place (2,) m that most speaks for, of cameras with masks (H, W), not near what was `tried`; or None."""
-        if not len(self.places):
+        enough = [mask for mask in masks.values() if cv2.countNonZero(mask) > LEAST_PX]
+        if not len(self.places) or len(enough) < 2:
             return None
         total, filled = np.zeros(len(self.places)), np.zeros(len(self.places), dtype=int)
         for camera, mask in masks.items():

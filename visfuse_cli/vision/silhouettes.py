@@ -165,7 +165,7 @@ def _owned(expected: Expected, who: int, window: tuple[int, int, int, int]) -> N
     left, top, right, bottom = window
     u, v = np.arange(left, right), np.arange(top, bottom)
     near = _distance(expected, who, u, v)
-    mine = near < CAP
+    mine = near < CAP**2
     boxes = expected.box
     with np.errstate(invalid="ignore"):
         close = (boxes[:, 2] > left) & (boxes[:, 0] < right) & (boxes[:, 3] > top) & (boxes[:, 1] < bottom)
@@ -175,16 +175,18 @@ def _owned(expected: Expected, who: int, window: tuple[int, int, int, int]) -> N
         theirs = _distance(expected, int(other), u, v)
         first = expected.rank[other] < expected.rank[who]
         before = expected.rank[other] == expected.rank[who] and expected.depth[other] < expected.depth[who]
-        mine &= theirs >= np.where(near < FRONT, near, CAP) if not (first or before) else theirs >= FRONT
-        mine &= (near <= theirs) | (near < FRONT)
+        mine &= theirs >= np.where(near < FRONT**2, near, CAP**2) if not (first or before) else theirs >= FRONT**2
+        mine &= (near <= theirs) | (near < FRONT**2)
     return mine
 
 
-def _distance(expected: Expected, who: int, u: NDArray[np.intp], v: NDArray[np.intp]) -> Array:
-    """Distance (h, w) of pixels from a person's axis, in half widths, its ends rounded."""
+def _distance(expected: Expected, who: int, u: NDArray[np.intp], v: NDArray[np.intp]) -> NDArray[np.float32]:
+    """Squared distance (h, w) of pixels from a person's axis, in half widths, its ends rounded."""
     foot, head = expected.axis[who]
     along = head - foot
     length = max(float(along @ along), 1e-9)
-    du, dv = u[None, :] - foot[0], v[:, None] - foot[1]
-    share = np.clip((du * along[0] + dv * along[1]) / length, 0.05, 0.95)
-    return np.asarray(np.hypot(du - share * along[0], dv - share * along[1]) / expected.half_width[who])
+    du, dv = (u - foot[0]).astype(np.float32)[None], (v - foot[1]).astype(np.float32)[:, None]
+    share = np.clip(du * np.float32(along[0] / length) + dv * np.float32(along[1] / length), 0.05, 0.95)
+    du = du - share * np.float32(along[0])
+    dv = dv - share * np.float32(along[1])
+    return np.asarray((du * du + dv * dv) * np.float32(expected.half_width[who] ** -2), np.float32)
