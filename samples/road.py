@@ -1,9 +1,9 @@
-"""Scenes from a seed: free flow, a queue at a red light, a junction; and points to calibrate from."""
+"""Scenes from a seed: free flow, queues at a red light, a junction; and points to calibrate from."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from fractions import Fraction
 
 import numpy as np
@@ -30,6 +30,20 @@ KMH = 1 / 3.6
 QUEUE = 5  # vehicles a lane
 
 
+@dataclass(frozen=True, slots=True)
+class View:
+    """Where a camera may be: height (m), how far ahead the picture's upper edge meets the ground (m), how far aside of
+    the road's course it may stand (degrees)."""
+
+    up_m: tuple[float, float]
+    reach_m: tuple[float, float]
+    slant_deg: float
+
+
+ASIDE = View((6, 9), (80, 100), 60.0)
+HIGH = View((9, 13), (60, 80), 20.0)
+
+
 def free_flow(
     seed: int,
     seconds: float,
@@ -50,24 +64,35 @@ def free_flow(
 
 
 def dense(seed: int, seconds: float, size: tuple[int, int] = (1280, 720), fps: Fraction = Fraction(25)) -> Scene:
-    """A red light: queues on every lane, trucks that hide cars, long shadows and a camera that shakes by 2 px."""
+    """A red light seen from a pole 9-13 m high: see `_queues`."""
+    return _queues(seed, seconds, size, fps, HIGH, (12, 18))
+
+
+def dense_low(seed: int, seconds: float, size: tuple[int, int] = (1280, 720), fps: Fraction = Fraction(25)) -> Scene:
+    """A red light seen from so low that the first rows hide most of the others: see `_queues`."""
+    return _queues(seed, seconds, size, fps, View((6, 9), (80, 100), 25.0), (16, 22))
+
+
+def _queues(
+    seed: int, seconds: float, size: tuple[int, int], fps: Fraction, view: View, sun: tuple[float, float]
+) -> Scene:
+    """Queues on every lane, trucks that hide cars, shadows longer than cars and a camera that shakes by 2 px."""
     rng = np.random.default_rng((seed, SCENE_STREAM))
     road = replace(_random_road(rng), stop_lines=((48.0, 1), (16.0, -1)))
-    camera, placement = _random_view(rng, road, size, slant=25.0)
+    camera, placement = _random_view(rng, road, size, view)
     red = (0.1 * seconds, 0.6 * seconds)
     vehicles: list[Vehicle] = []
     for x, direction in road.lanes:
         last = len(vehicles)
-        fleet = [random_vehicle(rng, last + i + 1, trucks=0.25) for i in range(QUEUE)]
+        fleet = [random_vehicle(rng, last + i + 1, trucks=0.2) for i in range(QUEUE)]
         stop = next(y * way for y, way in road.stop_lines if way == direction) - 1.0
         gaps = rng.uniform(8, 25, QUEUE) + np.array([vehicle.length for vehicle in fleet])
         starts = stop - rng.uniform(5, 30) - np.cumsum(gaps)
         speeds = rng.uniform(9, 13) * np.ones(QUEUE)
         drives = queue(x, direction, list(starts), [v.length for v in fleet], list(speeds), stop, red, seconds)
         vehicles += [replace(vehicle, trajectory=drive) for vehicle, drive in zip(fleet, drives, strict=True)]
-    light = _sun(rng, (16, 22))
     n_frames = round(seconds * fps)
-    return _placed(Scene(camera, placement, road, tuple(vehicles), light, fps, n_frames, seed, shake=2.0))
+    return _placed(Scene(camera, placement, road, tuple(vehicles), _sun(rng, sun), fps, n_frames, seed, shake=2.0))
 
 
 def junction(seed: int, seconds: float, size: tuple[int, int] = (1280, 720), fps: Fraction = Fraction(25)) -> Scene:
@@ -81,7 +106,12 @@ def junction(seed: int, seconds: float, size: tuple[int, int] = (1280, 720), fps
     return _placed(Scene(camera, placement, road, vehicles, _sun(rng, (30, 60)), fps, n_frames, seed))
 
 
-KINDS: dict[str, Callable[..., Scene]] = {"free-flow": free_flow, "dense": dense, "junction": junction}
+KINDS: dict[str, Callable[..., Scene]] = {
+    "free-flow": free_flow,
+    "dense": dense,
+    "dense-low": dense_low,
+    "junction": junction,
+}
 
 
 def calibration_points(
@@ -127,19 +157,16 @@ def _random_road(rng: np.random.Generator) -> Road:
 
 
 def _random_view(
-    rng: np.random.Generator, road: Road, size: tuple[int, int], slant: float = 60.0
+    rng: np.random.Generator, road: Road, size: tuple[int, int], view: View = ASIDE
 ) -> tuple[Camera, Placement]:
-    """A camera 6-9 m high, 26 m from the middle of the road at y = 26 and up to `slant` degrees aside of its course.
-
-    The picture's upper edge meets the ground 80-100 m ahead.
-    """
+    """A camera 26 m from the middle of the road at y = 26, somewhere in what `view` allows."""
     width, height = size
     focal = float(rng.uniform(900, 1400)) * width / 1280
-    up = float(rng.uniform(6, 9))
-    angle = np.radians(rng.uniform(-slant, slant))
+    up = float(rng.uniform(*view.up_m))
+    angle = np.radians(rng.uniform(-view.slant_deg, view.slant_deg))
     foot = np.array([sum(road.edges) / 2, 26.0]) - 26.0 * np.array([np.sin(angle), np.cos(angle)])
     yaw = angle + np.radians(rng.uniform(-2, 2))
-    pitch = np.arctan2(height / 2, focal) + np.arctan2(up, rng.uniform(80, 100))
+    pitch = np.arctan2(height / 2, focal) + np.arctan2(up, rng.uniform(*view.reach_m))
     roll = np.radians(rng.uniform(-1, 1))
     ahead = np.array([np.sin(yaw) * np.cos(pitch), np.cos(yaw) * np.cos(pitch), -np.sin(pitch)])
     level = np.array([np.cos(yaw), -np.sin(yaw), 0.0])

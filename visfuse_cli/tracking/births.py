@@ -27,7 +27,7 @@ from visfuse_cli.vision.wireframe import DIRECTIONS, Outlines
 
 SCAN_S = 0.3  # s between searches inside of regions
 MOST_GROWN = 2  # of the boxes found there that are followed back
-ASK_AGAIN_S = 0.1  # s until a candidate that was none is looked at again
+ASK_AGAIN_S = 0.1, 0.8  # s until a candidate that was none is looked at again: at first, and at most
 COURSE_FRAMES = 25  # the last frames of a candidate that tell its course
 SEEN = 0.6  # share of the frames of a new track in which its vehicle is seen
 LOST_S = 0.3  # s: a candidate unseen for longer is given up
@@ -44,6 +44,7 @@ class Candidate:
     drift: Array = field(default_factory=lambda: np.zeros(2))  # px/s
     missed_since: float | None = None
     asked_again: float = 0.0  # s: not before
+    patience: float = ASK_AGAIN_S[0]  # s until then
     scanned_again: float = 0.0  # s: not before
 
 
@@ -88,7 +89,6 @@ class Nursery:
             track = None
             t = candidate.samples[-1][1]
             if candidate.missed_since is None and t >= candidate.asked_again:
-                candidate.asked_again = t + ASK_AGAIN_S
                 track = self._confirmed(candidate, next_id, recent, taken_at, held)
             if track is None:
                 waiting.append(candidate)
@@ -204,7 +204,9 @@ class Nursery:
         if velocity is None:
             return None
         heading = float(np.arctan2(velocity[1], velocity[0]))
-        frame, _, evidence = recent[-1]
+        frame, t, evidence = recent[-1]
+        candidate.asked_again = t + candidate.patience
+        candidate.patience = min(2 * candidate.patience, ASK_AGAIN_S[1])
         settings, camera = self._settings, self._camera
         guess = best_guess(camera, settings, evidence, candidate.region, heading, taken_at(frame))
         if guess is None:

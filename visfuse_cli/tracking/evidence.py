@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Protocol
 
 import cv2
@@ -14,7 +15,7 @@ from visfuse_cli.records import Array, GroundCamera, Image, Region
 from visfuse_cli.tracking.association import overlap, region_boxes
 from visfuse_cli.vision import contour, regions, wireframe
 from visfuse_cli.vision.background import FOREGROUND
-from visfuse_cli.vision.contour import Fill, Look
+from visfuse_cli.vision.contour import Fill, Look, Sight
 from visfuse_cli.vision.labels import Labels
 from visfuse_cli.vision.regions import Band
 from visfuse_cli.vision.wireframe import Outlines
@@ -66,16 +67,23 @@ class LabelEvidence:
         return self._grey
 
     def look(self, pose: Array, size: Array, reach: Array) -> Look:
-        owner = contour.owners(self._camera, pose, size)
-        return contour.search(self._labels, owner, np.arange(1, len(pose) + 1), self._camera, pose, size, reach)
+        return contour.search([self._among((pose, size))], np.arange(1, len(pose) + 1), self._camera, pose, size, reach)
 
     def probe(self, pose: Array, size: Array, reach: Array, taken: Boxes) -> Look:
-        owner = contour.owners(self._camera, *taken)
-        return contour.search(self._labels, owner, np.zeros(len(pose), int), self._camera, pose, size, reach)
+        return contour.search([self._among(taken)], np.zeros(len(pose), int), self._camera, pose, size, reach)
+
+    @staticmethod
+    def probe_each(frames: Sequence[LabelEvidence], pose: Array, size: Array, reach: Array, taken: list[Boxes]) -> Look:
+        """Look for N boxes, each in a frame of its own as if it alone stood among those `taken` there."""
+        sights = [frame._among(boxes) for frame, boxes in zip(frames, taken, strict=True)]
+        return contour.search(sights, np.zeros(len(pose), int), frames[0]._camera, pose, size, reach)
+
+    def _among(self, boxes: Boxes) -> Sight:
+        return Sight(self._labels, contour.owners(self._camera, *boxes))
 
     def fill(self, pose: Array, size: Array, taken: Boxes) -> Fill:
         """A quick look at each of N boxes as if it alone stood among those `taken`."""
-        return contour.fill(self._labels, contour.owners(self._camera, *taken), self._camera, pose, size)
+        return contour.fill(self._among(taken), self._camera, pose, size)
 
     def leftovers(self, pose: Array, size: Array) -> list[Region]:
         found = regions.find(self._labels.picture(), self._cut, *self._cleaning, self._explained(pose, size))
@@ -148,6 +156,17 @@ class BoxEvidence:
     def _sides(self, number: int) -> Outlines:
         box = self._regions[number]
         return wireframe.tangents(box.hull, box.at_border, upright=True)
+
+
+def probe_each(frames: Sequence[Evidence], pose: Array, size: Array, reach: Array, taken: list[Boxes]) -> Look:
+    """Look for N boxes, each in a frame of its own as if it alone stood among those `taken` there."""
+    labelled = [frame for frame in frames if isinstance(frame, LabelEvidence)]
+    if len(labelled) == len(frames):
+        return LabelEvidence.probe_each(labelled, pose, size, reach, taken)
+    each = [slice(k, k + 1) for k in range(len(pose))]
+    return Look.joined(
+        [frame.probe(pose[k], size[k], reach[k], boxes) for frame, k, boxes in zip(frames, each, taken, strict=True)]
+    )
 
 
 def _nothing() -> Outlines:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from bisect import bisect_left
 from collections import deque
+from collections.abc import Sequence
 from functools import partial
 
 import numpy as np
@@ -19,7 +20,7 @@ from visfuse_cli.tracking.association import footprint_overlap
 from visfuse_cli.tracking.births import Nursery
 from visfuse_cli.tracking.dynamics import Dynamics, Prediction, Step
 from visfuse_cli.tracking.evidence import Boxes, Evidence
-from visfuse_cli.tracking.hypotheses import gain_of
+from visfuse_cli.tracking.hypotheses import Guess, gain_of
 from visfuse_cli.tracking.joining import WAIT_S
 from visfuse_cli.tracking.lookback import LEAST_OPEN, Recent
 from visfuse_cli.tracking.settings import TrackerSettings
@@ -37,6 +38,7 @@ KEPT = 0.9  # of its frames and of the outline seen in them a track keeps when i
 BETTER, MUCH_BETTER = 1.2, 2.0  # times as much must another box explain, and to be taken though seen for less time
 LOOK_BACK_FRAMES = 120  # at most
 REACH_PX, REACH_SHARE = (4.0, 24.0), 0.2  # how far from its prediction an outline is looked for; of its height
+BESIDE_M = 6.0  # m between two tracks that may be parts of one vehicle
 ONE_PLACE = 0.4  # of a footprint in another's: one of the two is wrong
 
 
@@ -110,11 +112,11 @@ class GroundTracker:
         pose = [self._pose_of(track.steps[-1].posterior.mean) for track in self.tracks]
         return np.array(pose).reshape(-1, 3), np.array([track.size for track in self.tracks]).reshape(-1, 3)
 
-    def _boxes_at(self, frame: int, without: Track | None = None) -> Boxes:
-        """Pose (N, 3) and size (N, 3) of the tracks that were followed in a frame, there, but for one."""
+    def _boxes_at(self, frame: int, without: Sequence[Track] = ()) -> Boxes:
+        """Pose (N, 3) and size (N, 3) of the tracks that were followed in a frame, there, but for some."""
         pose, size = [], []
         for track in self.tracks:
-            if track is without:
+            if any(track is each for each in without):
                 continue
             k = bisect_left(track.samples, frame, key=lambda sample: sample.frame)
             if k < len(track.samples) and track.samples[k].frame == frame:
@@ -174,21 +176,44 @@ class GroundTracker:
         track.compared = Comparison(
             self._t + track.compared.wait, box[:2], min(2 * track.compared.wait, WAIT_AT_MOST_S)
         )
-        frame = self._recent[-1][0]
-        taken = self._boxes_at(frame, without=track)
-        guess = self._nursery.rival(evidence, box, taken)
+        frame, parts = self._recent[-1][0], self._doubtful_beside(track)
+        guess = self._nursery.rival(evidence, box, self._boxes_at(frame, without=[track, *parts]))
         if guess is None:
             return
-        times = guess.gain / max(gain_of(self.camera, evidence, box[:3], box[3:], taken), 1e-9)
+        parts = [part for part in parts if self._shares_place(part, guess)]
+        replaced = [track, *parts]
+        taken = self._boxes_at(frame, without=replaced)
+        explained = [
+            gain_of(self.camera, evidence, self._pose_of(each.steps[-1].posterior.mean), each.size, taken)
+            for each in replaced
+        ]
+        times = guess.gain / max(float(np.nansum(explained)), 1e-9)
         if not times > BETTER:
             return
         velocity = self.dynamics.planar(track.steps[-1].posterior.mean)[0][2:]
-        before = partial(self._boxes_at, without=track)
+        before = partial(self._boxes_at, without=replaced)
         itself = [track]
         better = self._nursery.grown(guess, velocity, track.id, self._recent, before, itself)
         if better is not None and not itself and (times > MUCH_BETTER or _as_good(better, track)):
             better.compared = track.compared
             self.tracks[self.tracks.index(track)] = better
+            self.tracks = [each for each in self.tracks if not any(each is part for part in parts)]
+            self._held += [self._trimmed(part, f"part of track {track.id}") for part in parts]
+
+    def _doubtful_beside(self, track: Track) -> list[Track]:
+        """The other tracks near enough to be a part of the same vehicle, none of them sure."""
+        here = track.steps[-1].posterior.mean[:2]
+        return [
+            other
+            for other in self.tracks
+            if other is not track
+            and other.doubt > DOUBTFUL
+            and float(np.hypot(*(other.steps[-1].posterior.mean[:2] - here))) < BESIDE_M
+        ]
+
+    def _shares_place(self, track: Track, guess: Guess) -> bool:
+        pose = self._pose_of(track.steps[-1].posterior.mean)
+        return bool(footprint_overlap(pose[None], track.size[None], guess.pose[None], guess.size[None]) > ONE_PLACE)
 
     def _comparable(self, track: Track) -> bool:
         way = track.steps[-1].posterior.mean[:2] - track.compared.place

@@ -14,7 +14,7 @@ from visfuse_cli.records import Array, GroundCamera
 from visfuse_cli.tracking import dynamics as dynamics_tools
 from visfuse_cli.tracking import hypotheses, measure
 from visfuse_cli.tracking.dynamics import Dynamics
-from visfuse_cli.tracking.evidence import Boxes, Evidence
+from visfuse_cli.tracking.evidence import Boxes, Evidence, probe_each
 from visfuse_cli.tracking.hypotheses import Guess
 from visfuse_cli.tracking.settings import TrackerSettings
 from visfuse_cli.tracking.targets import Sample
@@ -23,6 +23,7 @@ from visfuse_cli.vision import wireframe
 REACH_PX = (4.0, 20.0)
 LEAST_OPEN = 0.2  # of a box in view to measure it
 PROOF, PROVEN = 10, 0.5  # frames after which a thing that was seen in few of them is none
+AT_ONCE = 5  # frames that are looked at together: what is expected in them differs little
 LOST_S = 0.3  # s without the thing: it was not there before
 
 Recent = deque[tuple[int, float, Evidence]]  # frame, t and what it showed, oldest first
@@ -41,48 +42,92 @@ def trace(
 
     Time runs backwards: to the motion model it is the same thing driving away the other way round.
     """
-    turned = np.array([guess.pose[0], guess.pose[1], guess.pose[2] + np.pi])
-    step = dynamics_tools.first(dynamics, dynamics.begin(turned, -velocity))
-    gate = gate_size(len(dynamics.H), settings.pose.gate)
-    before = last_seen = recent[-1][1]
-    samples: list[Sample] = []
-    poses: list[Array] = []
-    for frame, t, evidence in reversed(recent):
-        expected = dynamics_tools.predict(dynamics, [step], np.array([before - t]), guess.size[:1])[0]
-        mean = expected.prior.mean
-        pose = np.array([[mean[0], mean[1], dynamics.heading(mean) - np.pi]])
-        size = guess.size[None]
-        pixels, _ = project(camera, wireframe.corners(pose, size)[0])
-        foot, J = project(camera, np.append(pose[0, :2], 0.0)[None])
-        scale = ground_scale(camera, foot)[0]
-        outside = not np.all((pixels.max(axis=0) > 0) & (pixels.min(axis=0) < camera.image_size))
-        if outside or not scale < settings.life.max_scale or last_seen - t > LOST_S:
+    way = _Way(camera, settings, dynamics, guess, velocity, recent[-1][1])
+    frames = list(reversed(recent))
+    for first in range(0, len(frames), AT_ONCE):
+        if not way.follow(frames[first : first + AT_ONCE], taken_at):
             break
-        if len(samples) == PROOF and sum(sample.measured for sample in samples) < PROVEN * PROOF:
-            return [], np.zeros((0, 3))
-        spread = np.sqrt(np.trace(J[0, :, :2] @ expected.prior.cov[:2, :2] @ J[0, :, :2].T))
-        look = evidence.probe(pose, size, np.clip(3 * spread, *REACH_PX)[None], taken_at(frame))
-        fit = measure.fit_poses(camera, look.outlines, pose, size, guess.size_sigma, settings.pose)
-        step = dynamics_tools.coast(expected)
-        seen = bool(
-            fit.ok[0]
-            & measure.looks_right(fit, look.outlines)[0]
-            & hypotheses.convincing(look)[0]
-            & (look.open[0] > LEAST_OPEN)
-        )
-        if seen:
-            z, R = dynamics.measured(*measure.measurement(fit, 0, pose[0]))
-            z[2:] += np.pi  # the heading, where it is measured
-            gamma = dynamics_tools.residual(dynamics, z, mean)
-            seen = bool(mahalanobis(gamma, dynamics.H @ expected.prior.cov @ dynamics.H.T + R) < gate)
-            if seen:
-                step = dynamics_tools.take(dynamics, expected, z, R)
-                last_seen = t
-        samples.append(Sample(frame, t, look.outlines[0], float(look.border[0] * fit.agreed[0]), seen))
-        after = step.posterior.mean
-        poses.append(np.array([after[0], after[1], dynamics.heading(after) - np.pi]))
-        before = t
-    while samples and not samples[-1].measured:
-        samples.pop()
-        poses.pop()
-    return samples[::-1], np.array(poses[::-1]).reshape(-1, 3)
+    return way.path()
+
+
+class _Way:
+    """One thing on its way back: what was seen of it so far, the last first."""
+
+    def __init__(
+        self,
+        camera: GroundCamera,
+        settings: TrackerSettings,
+        dynamics: Dynamics,
+        guess: Guess,
+        velocity: Array,
+        t: float,
+    ) -> None:
+        self._camera, self._settings, self._dynamics, self._guess = camera, settings, dynamics, guess
+        turned = np.array([guess.pose[0], guess.pose[1], guess.pose[2] + np.pi])
+        self._step = dynamics_tools.first(dynamics, dynamics.begin(turned, -velocity))
+        self._gate = gate_size(len(dynamics.H), settings.pose.gate)
+        self._before = self._last_seen = t
+        self._samples: list[Sample] = []
+        self._poses: list[Array] = []
+
+    def path(self) -> tuple[list[Sample], Array]:
+        """Samples and poses (n, 3) from the first one that was measured on, in the order of time."""
+        first = next((k for k, sample in enumerate(self._samples[::-1]) if sample.measured), len(self._samples))
+        return self._samples[::-1][first:], np.array(self._poses[::-1][first:]).reshape(-1, 3)
+
+    def follow(self, frames: list[tuple[int, float, Evidence]], taken_at: Callable[[int], Boxes]) -> bool:
+        """Look for the thing in a few earlier frames at once; False where its way ends."""
+        pose, reach, whole = self._expected(np.array([t for _, t, _ in frames]))
+        frames = frames[: len(pose)]
+        if not frames:
+            return False
+        size = np.tile(self._guess.size, (len(frames), 1))
+        taken = [taken_at(frame) for frame, _, _ in frames]
+        look = probe_each([evidence for *_, evidence in frames], pose, size, reach, taken)
+        fit = measure.fit_poses(self._camera, look.outlines, pose, size, self._guess.size_sigma, self._settings.pose)
+        there = fit.ok & measure.looks_right(fit, look.outlines) & hypotheses.convincing(look)
+        there &= look.open > LEAST_OPEN
+        border = look.border * fit.agreed
+        for k, (frame, t, _) in enumerate(frames):
+            if self._last_seen - t > LOST_S:
+                return False
+            seen = self._take(t, measure.measurement(fit, k, pose[k]) if there[k] else None)
+            self._samples.append(Sample(frame, t, look.outlines[k], float(border[k]), seen))
+            mean = self._step.posterior.mean
+            self._poses.append(np.array([mean[0], mean[1], self._dynamics.heading(mean) - np.pi]))
+            if len(self._samples) == PROOF and sum(sample.measured for sample in self._samples) < PROVEN * PROOF:
+                self._samples, self._poses = [], []
+                return False
+        return whole
+
+    def _expected(self, t: Array) -> tuple[Array, Array, bool]:
+        """Poses (n, 3) and reaches (n,) px at the times t (s) before it leaves the picture, and whether it does not."""
+        camera, size = self._camera, self._guess.size
+        count = len(t)
+        ahead = dynamics_tools.predict(self._dynamics, [self._step] * count, self._before - t, np.full(count, size[0]))
+        mean = np.array([each.prior.mean for each in ahead])
+        pose = np.column_stack([mean[:, :2], self._dynamics.heading(mean) - np.pi])
+        pixels, _ = project(camera, wireframe.corners(pose, np.tile(size, (count, 1))))
+        foot, J = project(camera, np.column_stack([pose[:, :2], np.zeros(count)]))
+        low, high = pixels.min(axis=1), pixels.max(axis=1)
+        inside = np.all((high > 0) & (low < camera.image_size), axis=1)
+        inside &= ground_scale(camera, foot) < self._settings.life.max_scale
+        end = count if inside.all() else int(np.argmin(inside))
+        cov = np.array([each.prior.cov[:2, :2] for each in ahead])
+        spread = np.sqrt(np.einsum("nij,njk,nik->n", J[:, :, :2], cov, J[:, :, :2]))
+        return pose[:end], np.clip(3 * spread[:end], *REACH_PX), end == count
+
+    def _take(self, t: float, measured: tuple[Array, Array] | None) -> bool:
+        """Go back to t (s), with what was measured there if that fits; whether it did."""
+        dynamics, length = self._dynamics, self._guess.size[:1]
+        expected = dynamics_tools.predict(dynamics, [self._step], np.array([self._before - t]), length)[0]
+        self._before, self._step = t, dynamics_tools.coast(expected)
+        if measured is None:
+            return False
+        z, R = dynamics.measured(*measured)
+        z[2:] += np.pi  # the heading, where it is measured
+        gamma = dynamics_tools.residual(dynamics, z, expected.prior.mean)
+        if mahalanobis(gamma, dynamics.H @ expected.prior.cov @ dynamics.H.T + R) >= self._gate:
+            return False
+        self._step, self._last_seen = dynamics_tools.take(dynamics, expected, z, R), t
+        return True

@@ -97,6 +97,8 @@ def _summary(path: Path, verdict: Verdict) -> dict[str, Any]:
         "speed_ci95": [verdict.speed - Z95 * verdict.sigma, verdict.speed + Z95 * verdict.sigma],
         "direction": _degrees(verdict.course),
         "size": path.size.tolist(),
+        "outline_found": path.likeness,
+        "outline_support": path.support,
         "nis_mean": float(nis.mean()) if len(nis) else None,
         "nis_dof": path.nis_dof,
         "ended": path.ended_by,

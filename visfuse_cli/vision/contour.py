@@ -7,6 +7,7 @@ that touches it or a shadow beside it do not move the outline (Lou 2002, sec. 2:
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -73,20 +74,35 @@ class Look:
     def __getitem__(self, which: object) -> Look:
         return Look(*(getattr(self, name)[which] for name in self.__dataclass_fields__))
 
+    @staticmethod
+    def joined(looks: Sequence[Look]) -> Look:
+        """What several looks saw, in their order."""
+        names = [name for name in Look.__dataclass_fields__ if name != "outlines"]
+        outlines = Outlines.joined([look.outlines for look in looks])
+        return Look(outlines, *(np.concatenate([getattr(look, name) for look in looks]) for name in names))
+
+
+@dataclass(frozen=True, slots=True)
+class Sight:
+    """One picture's labels, and whose silhouette is nearest in each pixel (H, W) (see `owners`)."""
+
+    labels: Labels
+    owner: Image
+
 
 def search(
-    labels: Labels, owner: Image, code: NDArray[np.intp], camera: GroundCamera, pose: Array, size: Array, reach: Array
+    sights: Sequence[Sight], code: NDArray[np.intp], camera: GroundCamera, pose: Array, size: Array, reach: Array
 ) -> Look:
     """Look for the outlines of N boxes with pose (N, 3) and size (N, 3), at most `reach` (N,) px off.
 
-    `labels` are the picture and `owner` (H, W) whose silhouette is nearest in each pixel (see `owners`); `code`
-    (N,) is what the boxes are called there, 0 when they are not.
+    All of them are looked for in one of `sights`, or each in its own; `code` (N,) is what the boxes are called among
+    the owners there, 0 when they are not.
     """
     count = len(pose)
     middle, at, normal, edge, share, total = _places(camera, pose, size)
     offset = reach[:, None] * np.linspace(-1, 1, 2 * STEPS + 1)  # (N, S)
     along = at[:, :, None] + normal[:, :, None] * offset[:, None, :, None]  # (N, K, S, 2)
-    label, whose, inside = _look(labels, owner, camera, along)
+    label, whose, inside = _look(sights, camera, along)
     known = inside & ((whose == 0) | (whose == code[:, None, None]))
     found = np.full((2, *share.shape), np.nan)
     for k, moved in enumerate((label == FOREGROUND, label > 0)):  # shadow is outside, or it is grey paint
@@ -101,7 +117,7 @@ def search(
 
     in_view = known.mean(axis=2) > OPEN
     told = in_view & (valid | ~_amidst(label, known))
-    label, whose, inside = _look(labels, owner, camera, _spokes(middle, at, _RADII))
+    label, whose, inside = _look(sights, camera, _spokes(middle, at, _RADII))
     own = inside & (whose == code[:, None, None])
     area = _areas(middle, at, normal)[..., None] * np.ones(len(_RADII))
     area /= np.maximum(area.sum(axis=(1, 2), keepdims=True), 1e-9)
@@ -130,16 +146,16 @@ class Fill:
     clear: Array
 
 
-def fill(labels: Labels, owner: Image, camera: GroundCamera, pose: Array, size: Array) -> Fill:
-    """What N boxes with pose (N, 3) and size (N, 3) are filled with, among those that `owner` (H, W) holds."""
+def fill(sight: Sight, camera: GroundCamera, pose: Array, size: Array) -> Fill:
+    """What N boxes with pose (N, 3) and size (N, 3) are filled with, among the owners there."""
     middle, at, normal, _, _, total = _places(camera, pose, size)
-    label, whose, inside = _look(labels, owner, camera, _spokes(middle, at[:, ::2], _RADII[1::2]))
+    label, whose, inside = _look([sight], camera, _spokes(middle, at[:, ::2], _RADII[1::2]))
     free = inside & (whose == 0)
     area = _areas(middle, at, normal)
     weight = area[:, ::2, None] * free
     whole = np.maximum(weight.sum(axis=(1, 2)), 1e-9)
     off = np.clip(OUTSIDE * total / np.pi, *OUTSIDE_PX)
-    around, whose, inside = _look(labels, owner, camera, at + off[:, None, None] * normal)
+    around, whose, inside = _look([sight], camera, at + off[:, None, None] * normal)
     told = inside & (whose == 0)
     # half of what a place's border length times its distance from the middle sums up to
     return Fill(
@@ -214,17 +230,18 @@ def _share(part: np.ndarray, whole: np.ndarray, weight: Array | float) -> Array:
     return np.where(every > LEAST, np.sum(part * weight, axis=axes) / np.maximum(every, 1e-9), np.nan)
 
 
-def _look(
-    labels: Labels, owner: Image, camera: GroundCamera, points: Array
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Labels, owners and whether they lie in the picture, at points (..., 2) px."""
+def _look(sights: Sequence[Sight], camera: GroundCamera, points: Array) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Labels, owners and whether they lie in the picture, at points (N, ..., 2) px of one sight or of N."""
     if camera.ground.lens is not None:
         points = distort_points(points.reshape(-1, 2), camera.ground.lens).reshape(points.shape)
-    height, width = owner.shape
+    height, width = sights[0].owner.shape
     whole = np.round(np.clip(points, -2, 1e5)).astype(int)
     u, v = np.clip(whole[..., 0], 0, width - 1), np.clip(whole[..., 1], 0, height - 1)
     inside = (whole[..., 0] > 0) & (whole[..., 0] < width - 1) & (whole[..., 1] > 0) & (whole[..., 1] < height - 1)
-    return labels.at(v, u), owner[v, u], inside
+    if len(sights) == 1:
+        return sights[0].labels.at(v, u), sights[0].owner[v, u], inside
+    label = np.stack([sight.labels.at(v[k], u[k]) for k, sight in enumerate(sights)])
+    return label, np.stack([sight.owner[v[k], u[k]] for k, sight in enumerate(sights)]), inside
 
 
 def _border(evidence: np.ndarray, offset: Array) -> Array:

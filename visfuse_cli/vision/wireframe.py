@@ -52,6 +52,13 @@ class Outlines:
         """N outlines as one."""
         return Outlines(*(np.stack([getattr(o, name) for o in outlines]) for name in Outlines.__dataclass_fields__))
 
+    @staticmethod
+    def joined(outlines: Sequence[Outlines]) -> Outlines:
+        """Several sets of outlines as one."""
+        return Outlines(
+            *(np.concatenate([getattr(o, name) for o in outlines]) for name in Outlines.__dataclass_fields__)
+        )
+
 
 @dataclass(frozen=True, slots=True)
 class BoxFit:
@@ -153,25 +160,25 @@ def fit(
     x = prior.copy()
     valid, normal = outlines.valid, outlines.normal
     noise = np.asarray(sigma_px, dtype=float)[:, None]
-    rows = np.arange(len(x))[:, None]
-    share = outlines.share[..., None]
+    shares = _corner_shares(outlines)
     N = np.tile(np.eye(6), (len(x), 1, 1))
     residual = np.zeros_like(outlines.support)
     for _ in range(iterations):
         pixels, J_pixel = project(camera, corners(x[:, :3], x[:, 3:]))
         pixels, J_pixel = np.nan_to_num(pixels, nan=-1e9), np.nan_to_num(J_pixel)
-        outermost = np.argmax(np.einsum("nck,ndk->ncd", pixels, normal), axis=1)
-        first, second = (np.where(outlines.tangent[:, None], outermost, outlines.corner[..., k]) for k in (0, 1))
-        at = (1 - share) * pixels[rows, first] + share * pixels[rows, second]
-        residual = outlines.support - np.einsum("ndk,ndk->nd", at, normal)
+        if outlines.tangent.any():
+            outermost = np.argmax(pixels @ normal.swapaxes(1, 2), axis=1)
+            shares[outlines.tangent] = np.eye(8)[outermost[outlines.tangent]]
+        residual = outlines.support - np.sum((shares @ pixels) * normal, axis=-1)
         J_corner = J_pixel @ _corner_jacobian(x[:, :3], x[:, 3:])  # (N, 8, 2, 6)
-        J_at = (1 - share)[..., None] * J_corner[rows, first] + share[..., None] * J_corner[rows, second]
-        J = np.einsum("ndkp,ndk->ndp", J_at, normal)
+        J_at = (shares @ J_corner.reshape(len(x), 8, 12)).reshape(*residual.shape, 2, 6)
+        J = (normal[:, :, None] @ J_at)[:, :, 0]
         # A Cauchy weight: a mirror, a patch of shadow or a missing corner moves one row, not the box.
         robust = valid / (1 + (residual / (3 * noise)) ** 2) / noise**2
-        N = np.einsum("nd,ndp,ndq->npq", robust, J, J) + weight[:, :, None] * np.eye(6)
+        weighted = (robust[..., None] * J).swapaxes(1, 2)
+        N = weighted @ J + weight[:, :, None] * np.eye(6)
         N += 1e-9 * np.trace(N, axis1=1, axis2=2)[:, None, None] * np.eye(6)
-        gradient = np.einsum("nd,ndp,nd->np", robust, J, residual) + weight * (prior - x)
+        gradient = (weighted @ residual[..., None])[..., 0] + weight * (prior - x)
         step = np.linalg.solve(N, gradient[..., None])[..., 0]
         limit = np.minimum(1, 2.0 / np.maximum(np.linalg.norm(step[:, :2], axis=1), 1e-9))
         x = x + step * limit[:, None]
@@ -183,6 +190,15 @@ def fit(
     ok = (seen >= 3) & np.all(np.isfinite(x), axis=1)
     agreed = np.sum(valid & (np.abs(residual) < 3 * noise), axis=1) / np.maximum(seen, 1)
     return BoxFit(x[:, :3], x[:, 3:], np.asarray(np.linalg.inv(N)), rms, agreed, ok)
+
+
+def _corner_shares(outlines: Outlines) -> Array:
+    """How much (N, K, 8) of each corner is in the model points of N outlines."""
+    shares = np.zeros((*outlines.share.shape, 8))
+    n, k = np.indices(outlines.share.shape)
+    shares[n, k, outlines.corner[..., 0]] = 1 - outlines.share
+    shares[n, k, outlines.corner[..., 1]] = outlines.share
+    return shares
 
 
 def silhouette(camera: GroundCamera, pose: Array, size: Array) -> Array:
