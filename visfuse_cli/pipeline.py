@@ -10,6 +10,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -93,9 +94,17 @@ class Run:
 
     def frames(self, source: VideoSource, total: int | None = None) -> Iterator[Frame]:
         """The frames of one clip, decoded ahead in a thread, until they end or the run is stopped."""
-        with ahead(source.frames) as frames, self._bar(source.frame_count if total is None else total) as bar:
-            for frame in self._waited(frames):
-                yield frame
+        return self.prepared(source, lambda frame: frame, total)
+
+    def prepared(self, source: VideoSource, prepare: Callable[[Frame], T], total: int | None = None) -> Iterator[T]:
+        """What `prepare` makes of the frames of one clip, one after another, in the thread that decodes them."""
+
+        def produce() -> Iterator[tuple[T]]:
+            return ((prepare(frame),) for frame in source.frames())
+
+        with ahead(produce) as items, self._bar(source.frame_count if total is None else total) as bar:
+            for (item,) in self._waited(items):
+                yield item
                 bar.update()
                 if self.stopped_by is not None:
                     return
@@ -219,6 +228,35 @@ class _Cursor:
         else:
             self._after = next(self._frames, None)
         return best
+
+
+def with_next(items: Iterator[T]) -> Iterator[tuple[T, T | None]]:
+    """Each item with the one after it; None after the last."""
+    before = next(items, None)
+    for item in items:
+        assert before is not None
+        yield before, item
+        before = item
+    if before is not None:
+        yield before, None
+
+
+@contextmanager
+def helper() -> Iterator[Callable[[Callable[[], T]], Callable[[], T]]]:
+    """A thread for one piece of work at a time: hand it over, call what comes back for the result.
+
+    Where a run may use no other thread the work is done when it is handed over: the order is the same.
+    """
+    if thread_cap() == 1:
+
+        def at_once(work: Callable[[], T]) -> Callable[[], T]:
+            result = work()
+            return lambda: result
+
+        yield at_once
+        return
+    with ThreadPoolExecutor(1, "visfuse-help") as pool:
+        yield lambda work: pool.submit(work).result
 
 
 class _TimedWriter:

@@ -29,11 +29,11 @@ from visfuse_cli.files.video_writer import VideoWriter
 from visfuse_cli.files.wall_clock import began, check_pattern, known_zone
 from visfuse_cli.maths.cameras import ground_camera, raised
 from visfuse_cli.maths.polygons import Polygon
-from visfuse_cli.pipeline import Run
-from visfuse_cli.records import Array, GroundCamera, GroundMap, Image, RunRequest, RunResult, TimeAudit
+from visfuse_cli.pipeline import Run, helper, with_next
+from visfuse_cli.records import Array, Frame, GroundCamera, GroundMap, Image, RunRequest, RunResult, TimeAudit
 from visfuse_cli.tracking.annotate import annotate
 from visfuse_cli.tracking.camera_watch import CameraWatch
-from visfuse_cli.tracking.foreground import Detections, Detector, MovingRegions
+from visfuse_cli.tracking.foreground import Detections, Detector, HandOver, MovingRegions
 from visfuse_cli.tracking.ground import GroundTracker
 from visfuse_cli.tracking.headlights import Headlights
 from visfuse_cli.tracking.ledger import Ledger, Recording, utc
@@ -234,30 +234,28 @@ def _track(clip: _Clip, run_: Run, spool: TrackSpool, results: _Results, first_i
     tracker = GroundTracker(clip.camera, clip.config, first_id)
     results.ledger.drawn[clip.name] = []
     strangers = results.strangers[clip.name] = Strangers(clip.camera)
-    with run_.stage("warm up"):
-        empty = empty_picture(at_rest(_sampled(clip.source, clip.config.background.warmup_s)))
-        watch = results.watches[clip.name] = CameraWatch(empty)
-        look, lamps = _detector(clip, empty), Headlights(empty, clip.camera)
-    of = Recording(clip.name, label, clip.camera, results.began[clip.name], watch.image_from_rest)
-    for shown in run_.frames(clip.source):
-        run_.count("frames")
-        with run_.stage("steady"):
-            frame = watch.steadied(shown)
-        if frame is None:
-            continue
-        tracker.predict(frame.t)
-        with run_.stage("detect"):
-            evidence = look.evidence(frame, tracker.expected())
-        with run_.stage("track"):
-            ended = tracker.update(frame.index, evidence)
-            if clip.config.privacy.blur:
-                strangers.add(frame.index, tracker.unexplained)
-            lamps.look(frame, tracker.tracks, tracker.headings())
-        with run_.stage("conclude"):
-            _settle(*ended, of, tracker, lamps, run_, spool, results.ledger)
-        with run_.stage("learn"):
-            look.learn(frame, tracker)
-    _settle(*tracker.finish(), of, tracker, lamps, run_, spool, results.ledger)
+    with helper() as hand_over:
+        with run_.stage("warm up"):
+            empty = empty_picture(at_rest(_sampled(clip.source, clip.config.background.warmup_s)))
+            watch = results.watches[clip.name] = CameraWatch(empty)
+            look, lamps = _detector(clip, empty, hand_over), Headlights(empty, clip.camera)
+        of = Recording(clip.name, label, clip.camera, results.began[clip.name], watch.image_from_rest)
+        for frame, following in with_next(_steadied(clip.source, watch, run_)):
+            tracker.predict(frame.t)
+            with run_.stage("detect"):
+                evidence = look.evidence(frame, tracker.expected())
+            if following is not None:
+                look.foresee(following)
+            with run_.stage("track"):
+                ended = tracker.update(frame.index, evidence)
+                if clip.config.privacy.blur:
+                    strangers.add(frame.index, tracker.unexplained)
+                lamps.look(frame, tracker.tracks, tracker.headings())
+            with run_.stage("conclude"):
+                _settle(*ended, of, tracker, lamps, run_, spool, results.ledger)
+            with run_.stage("learn"):
+                look.learn(frame, tracker)
+        _settle(*tracker.finish(), of, tracker, lamps, run_, spool, results.ledger)
     results.suns[clip.name] = look.report()
     audit = results.audits[clip.name] = clip.source.audit()
     for warning in (*audit.warnings, *watch.warnings(clip.name)):
@@ -265,12 +263,22 @@ def _track(clip: _Clip, run_: Run, spool: TrackSpool, results: _Results, first_i
     return tracker.next_id
 
 
-def _detector(clip: _Clip, empty: Image) -> Detector:
+def _steadied(source: VideoSource, watch: CameraWatch, run_: Run) -> Iterator[Frame]:
+    """The frames in which the scene is recognised, as the camera at rest sees them."""
+    for frame in run_.prepared(source, watch.steadied):
+        run_.count("frames")
+        if frame is not None:
+            yield frame
+
+
+def _detector(clip: _Clip, empty: Image, hand_over: HandOver) -> Detector:
     config = clip.config
     region = Region(np.array(config.region)) if config.region else None
     if clip.boxes is not None:
         return Detections(clip.camera, clip.boxes, region)
-    return MovingRegions(clip.camera, config.background, config.regions, config.target.smallest, empty, region)
+    return MovingRegions(
+        clip.camera, config.background, config.regions, config.target.smallest, empty, region, hand_over
+    )
 
 
 def _sampled(source: VideoSource, warmup_s: float) -> Iterator[Any]:

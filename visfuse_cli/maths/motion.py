@@ -173,14 +173,34 @@ def bicycle_noise(
     x (..., 5) is the state at the start; sigma_a (m/s^2 per root Hz) and sigma_steer (rad/s per root Hz) are the
     square roots of the spectral densities of a and b in Lou 2002, eq. 1; `straighten` as in `bicycle`.
     """
+    return bicycle_step(x, dt, wheelbase, sigma_a, sigma_steer, straighten)[2]
+
+
+def bicycle_step(
+    x: Array,
+    dt: ArrayLike,
+    wheelbase: ArrayLike,
+    sigma_a: ArrayLike,
+    sigma_steer: ArrayLike,
+    straighten: float = 0.0,
+) -> tuple[Array, Array, Array]:
+    """`bicycle`'s state and Jacobian, and `bicycle_noise`'s Q, from one evaluation.
+
+    What strikes on the way is carried to the end as from the start, turned by the heading gained until then: exact
+    where nothing is straightened.
+    """
     x, dt = np.asarray(x, dtype=float), np.asarray(dt, dtype=float)
     density = np.stack(np.broadcast_arrays(np.asarray(sigma_a) ** 2.0, np.asarray(sigma_steer) ** 2.0), axis=-1)
     dt = np.broadcast_to(dt, np.broadcast_shapes(x.shape[:-1], dt.shape))
-    struck = dt * ((1 + NODES) / 2).reshape(3, *[1] * dt.ndim)  # when the noise strikes, points first: (3, ...)
-    there = bicycle(x, struck, wheelbase, straighten)[0]
-    to_end = bicycle(there, dt - struck, wheelbase, straighten)[1][..., [2, 4]]
+    left = dt * np.append((1 + NODES) / 2, 1.0).reshape(4, *[1] * dt.ndim)  # when noise strikes, s before the end
+    moved, F = bicycle(x, left, wheelbase, straighten)
+    to_end, gained = F[:-1, ..., [2, 4]], wrap(moved[-2::-1, ..., 3] - x[..., 3])  # the nodes are symmetric
+    c, s = np.cos(gained)[..., None], np.sin(gained)[..., None]
+    along, across = to_end[..., 0, :], to_end[..., 1, :]
+    turned = np.stack([c * along - s * across, s * along + c * across], axis=-2)
+    to_end = np.concatenate([turned, to_end[..., 2:, :]], axis=-2)
     rates = (to_end * density[..., None, :]) @ transpose(to_end)
-    return symmetrise(np.tensordot(WEIGHTS / 2, rates, axes=1) * dt[..., None, None])
+    return moved[-1], F[-1], symmetrise(np.tensordot(WEIGHTS / 2, rates, axes=1) * dt[..., None, None])
 
 
 def bicycle_velocity(x: Array) -> tuple[Array, Array]:

@@ -49,6 +49,7 @@ class Path:
     pixel: Array
     nis: Array
     nis_dof: int  # numbers in a measurement
+    noise: float  # times as much as was expected of the outlines
     refused: int
     likeness: float  # mean share of the outline that was found, of what could be
     support: float  # the same, of all of it: what is hidden, out of the picture or amidst others counts
@@ -59,7 +60,7 @@ class Path:
 
 def conclude(track: Track, camera: GroundCamera, settings: TrackerSettings, dynamics: Dynamics) -> Path:
     """Settle a track's size, fit every frame again with it, and smooth; with `smooth` off, keep the causal states."""
-    samples, steps, misfit = track.samples, track.steps, np.nan
+    samples, steps, misfit, noise = track.samples, track.steps, np.nan, 1.0
     size, size_sigma, size_pull = track.size, track.size_sigma, np.zeros((len(samples), 2, 3))
     nis = _nis(steps)
     class_name = track.prior_class.name
@@ -75,7 +76,7 @@ def conclude(track: Track, camera: GroundCamera, settings: TrackerSettings, dyna
         fit = measure.fit_poses(camera, outlines, pose, size, np.full(3, 0.01), settings.pose)
         size_pull = fit.cov[:, :2, 3:] @ np.linalg.inv(fit.cov[:, 3:, 3:])
         misfit = float(np.median(fit.rms[used]))
-        steps, measured = _filter_again(samples, steps, fit, pose, size, settings, dynamics)
+        steps, measured, noise = _filter_again(samples, steps, fit, pose, size, settings, dynamics)
         nis = _nis(steps)
         belief = dynamics_tools.smooth(dynamics, steps)
     else:
@@ -101,6 +102,7 @@ def conclude(track: Track, camera: GroundCamera, settings: TrackerSettings, dyna
         pixel=pixel,
         nis=nis,
         nis_dof=len(dynamics.H),
+        noise=noise,
         refused=track.refused,
         likeness=float(np.nanmean([s.border for s in samples if s.measured])),
         support=float(np.mean([s.outline.tangent or s.outline.valid.mean() for s in samples if s.measured])),
@@ -137,8 +139,11 @@ def _filter_again(
     size: Array,
     settings: TrackerSettings,
     dynamics: Dynamics,
-) -> tuple[list[Step], NDArray[np.bool_]]:
-    """Filter the settled poses; a second time with the noise that the innovations of the whole track speak of."""
+) -> tuple[list[Step], NDArray[np.bool_], float]:
+    """Filter the settled poses; a second time with the noise that the innovations of the whole track speak of.
+
+    Returns that noise too, as a share of what was expected.
+    """
     measured = [
         dynamics.measured(*measure.measurement(fit, k, pose[k])) if samples[k].measured and fit.ok[k] else None
         for k in range(len(samples))
@@ -149,7 +154,7 @@ def _filter_again(
         nis = _nis(steps)
         if len(nis) >= 5:
             scale *= float(np.clip(np.mean(nis) / len(dynamics.H), 0.2, 25.0))
-    return steps, trusted
+    return steps, trusted, scale
 
 
 def _start(

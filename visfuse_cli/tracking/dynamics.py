@@ -81,8 +81,7 @@ def _bicycle(filter_: FilterSettings, accelerates: bool, fades: bool) -> Dynamic
         wheelbase = WHEELBASE_SHARE * length
         if accelerates:
             return covariance_updating.advance(x, cov, dt, wheelbase, steer, filter_.sigma_jerk, straighten)
-        following, F = motion.bicycle(x, dt, wheelbase, straighten)
-        return following, F, motion.bicycle_noise(x, dt, wheelbase, filter_.sigma_a, steer, straighten)
+        return motion.bicycle_step(x, dt, wheelbase, filter_.sigma_a, steer, straighten)
 
     size = 6 if accelerates else 5
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, Literal, Protocol
 
 import cv2
@@ -20,6 +21,7 @@ from visfuse_cli.vision.background import Background
 from visfuse_cli.vision.lens import distort_points
 from visfuse_cli.vision.steady import moved
 
+HandOver = Callable[[Callable[[], Image]], Callable[[], Image]]  # work to be done elsewhere -> its result, when called
 SETTLED = 12  # frames after which a track's size is known well enough to tell its shadow
 
 
@@ -42,8 +44,17 @@ class RegionSettings(Section):
     speck: float = Field(0.12, ge=0, le=5, description="m: specks below this size are removed")
 
 
+def at_once(work: Callable[[], Image]) -> Callable[[], Image]:
+    """Work that is done here and now."""
+    result = work()
+    return lambda: result
+
+
 class Detector(Protocol):
     """A source of evidence, asked frame by frame."""
+
+    def foresee(self, frame: Frame) -> None:
+        """Begin to look at the frame that comes after the present one, while that is thought about."""
 
     def evidence(self, frame: Frame, expected: Boxes) -> Evidence:
         """What a frame says, in which boxes are expected."""
@@ -66,8 +77,9 @@ class MovingRegions:
         smallest_m: float,
         empty: Image,
         region: Region | None = None,
+        hand_over: HandOver = at_once,
     ) -> None:
-        self._camera = camera
+        self._camera, self._hand_over = camera, hand_over
         self._cleaning = cleaning.gap, cleaning.speck, smallest_m
         self._bands = region_tools.bands(camera)
         self._background = Background(
@@ -76,10 +88,18 @@ class MovingRegions:
         self._background.start(empty)
         self._watched = None if region is None else region.picture(camera)
         self._sun, self._shade = Sun(camera), Shade(background.shadow_ratio)
-        self._labels = np.zeros((0, 0), np.uint8)
+        self._found: Callable[[], Image] | None = None  # what is being looked at ahead
+        self._raw = self._labels = np.zeros((0, 0), np.uint8)
+
+    def foresee(self, frame: Frame) -> None:
+        self._found = self._hand_over(lambda: self._background.detect(frame.image))
 
     def evidence(self, frame: Frame, expected: Boxes) -> Evidence:
-        labels = self._background.detect(frame.image)
+        if self._found is None:
+            self.foresee(frame)
+        assert self._found is not None
+        labels = self._raw = self._found()
+        self._found = None
         if self._watched is not None:
             labels = np.asarray(cv2.bitwise_and(labels, self._watched), dtype=np.uint8)
         if self._sun.shadow is not None and self._shade.needed and len(expected[0]):
@@ -97,7 +117,9 @@ class MovingRegions:
         lens = self._camera.ground.lens
         if lens is not None:
             followed = [distort_points(outline, lens) for outline in followed if len(outline)]
-        self._background.learn(frame.image, frame.t, followed)
+        if self._found is not None:
+            self._found()  # the model must not change while it is looked at
+        self._background.learn(frame.image, frame.t, followed, self._raw)
 
     def report(self) -> dict[str, Any] | None:
         return None if self._sun.shadow is None else self._sun.shadow.report()
@@ -108,6 +130,9 @@ class Detections:
 
     def __init__(self, camera: GroundCamera, boxes: dict[int, Array], region: Region | None = None) -> None:
         self._camera, self._boxes, self._region = camera, boxes, region
+
+    def foresee(self, frame: Frame) -> None:
+        """Boxes from outside are there already."""
 
     def evidence(self, frame: Frame, expected: Boxes) -> Evidence:
         rows = self._boxes.get(frame.index, np.zeros((0, 5)))

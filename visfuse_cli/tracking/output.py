@@ -100,6 +100,7 @@ def _summary(path: Path, verdict: Verdict) -> dict[str, Any]:
         "outline_found": path.likeness,
         "outline_support": path.support,
         "nis_mean": float(nis.mean()) if len(nis) else None,
+        "noise_scale": path.noise,
         "nis_dof": path.nis_dof,
         "ended": path.ended_by,
         "rejected": verdict.reason or None,

@@ -36,7 +36,10 @@ class SpeedSettings(Section):
     )
     min_measured: float = Field(0.6, ge=0, le=1, description="share of a track's frames that must be measured")
     min_support: float = Field(
-        0.45, ge=0, le=1, description="that share, times the share of its whole outline that was found, must reach"
+        0.4, ge=0, le=1, description="that share, times the share of its whole outline that was found, must reach"
+    )
+    min_proof: float = Field(
+        1.2, ge=0, le=20, description="by how much it must, times the root of the frames: a part seen for long is proof"
     )
     max_misfit: float = Field(0.2, gt=0, le=5, description="outline misfit over outline size: above, no such box")
     max_size_z: float = Field(4.0, gt=0, le=100, description="deviations of a size from its class")
@@ -158,8 +161,9 @@ def _reason(path: Path, verdict: Verdict, settings: SpeedSettings, trusted: bool
         return f"no {path.class_name} measures {length:.1f} x {width:.1f} x {height:.1f} m: a part, or several"
     if path.likeness < settings.min_likeness:
         return f"unlike a {path.class_name}: {100 * path.likeness:.0f} % of its outline was seen"
-    if path.likeness * path.support < settings.min_support:
-        return f"too little seen: {100 * path.support:.0f} % of a {path.class_name}'s whole outline"
+    proof = (path.likeness * path.support - settings.min_support) * np.sqrt(np.count_nonzero(path.measured))
+    if proof < settings.min_proof:
+        return f"too little seen: {100 * path.support:.0f} % of a {path.class_name}'s outline in {frames} frames"
     outline = _outline_px(path)
     if np.isfinite(path.misfit_px) and path.misfit_px > settings.max_misfit * outline + 3:
         return f"no box fits: outline off by {path.misfit_px:.0f} px (several vehicles, a shadow or a reflection)"

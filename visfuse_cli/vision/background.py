@@ -71,8 +71,10 @@ class Background:
             self._labels[part][alike & (self._corrected[part] > 0)] = 0
         return self._labels
 
-    def learn(self, image: Image, t: float, followed: Iterable[Array]) -> None:
-        """Adapt to `image` (H, W, 3) at t (s), the one looked at last, except inside the followed outlines (k, 2) px.
+    def learn(self, image: Image, t: float, followed: Iterable[Array], labels: Image | None = None) -> None:
+        """Adapt to `image` (H, W, 3) at t (s), except inside the followed outlines (k, 2) px.
+
+        `labels` are what `detect` said of it; None: it is the one looked at last.
 
         A thing that the background holds and that is no longer there is taken out of it at once.
         """
@@ -81,7 +83,7 @@ class Background:
             return
         rate = float(np.clip((t - self._learnt_t) / self._memory_s, 0, 1))
         self._waiting, self._learnt_t = 0, t
-        self._forget_ghosts(image, t)
+        self._forget_ghosts(image, t, self._labels if labels is None else labels)
         hulls = [np.round(hull).astype(np.int32) for hull in followed]
         if hulls:
             mask = np.zeros(image.shape[:2], np.uint8)
@@ -92,16 +94,17 @@ class Background:
         self._model.apply(image, learningRate=rate)
         self._picture = cv2.addWeighted(image, max(rate, 1 / 64), self._picture, 1 - max(rate, 1 / 64), 0)
 
-    def _forget_ghosts(self, image: Image, t: float) -> None:
+    def _forget_ghosts(self, image: Image, t: float, now: Image | None) -> None:
         if self._compared is not None and t - self._compared[0] < STILL_S:
             return
-        assert self._labels is not None
+        assert self._picture is not None
+        assert now is not None
         grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
         if self._compared is not None:
             _, earlier, labels = self._compared
-            moved = cv2.compare(cv2.bitwise_and(self._labels, labels), FOREGROUND, cv2.CMP_EQ)
+            moved = cv2.compare(cv2.bitwise_and(now, labels), FOREGROUND, cv2.CMP_EQ)
             gone = find_ghosts(grey, earlier, moved, cv2.cvtColor(self._picture, cv2.COLOR_BGR2GRAY))
             if gone.any():
                 cv2.copyTo(image, gone, self._picture)
                 self._corrected = gone if self._corrected is None else cv2.bitwise_or(self._corrected, gone)
-        self._compared = t, grey, self._labels
+        self._compared = t, grey, now

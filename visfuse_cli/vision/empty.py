@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import cv2
 import numpy as np
@@ -73,7 +74,7 @@ def _tolerance(blocks: Image) -> Image:
     return np.asarray(np.minimum(ALIKE + SHIFTED_PX * np.hypot(*slopes), 3 * ALIKE), dtype=np.uint8)
 
 
-def _mean(values: Array, which: NDArray[np.bool_]) -> Array:
+def _mean(values: NDArray[Any], which: NDArray[np.bool_]) -> Array:
     """Mean (h, w) of the chosen ones of n values (n, h, w)."""
     return np.asarray(np.where(which, values, 0).sum(axis=0) / np.maximum(which.sum(axis=0), 1))
 
