@@ -57,8 +57,9 @@ def empty_picture(images: Sequence[Image]) -> Image:
         in_light |= in_shadow & (_mean(beside, lit) > _mean(beside, shows) + LIT_TOGETHER)
         shows[:, in_light] = lit[:, in_light]
         left = ~(sure | in_light)
-        likely = np.exp(-off[:, None, left] / UNLIKE)
-        shows[:, left] = _recurring(blocks[:, None, left], likely, alike[None, left], beside[:, None, left])[:, 0]
+        if left.any():
+            likely = np.exp(-off[:, None, left] / UNLIKE)
+            shows[:, left] = _recurring(blocks[:, None, left], likely, alike[None, left], beside[:, None, left])[:, 0]
     total, count = np.zeros((high, wide, 3), np.float32), np.zeros((high, wide), np.float32)
     for image, shown in zip(images, shows, strict=True):
         mask = cv2.resize(shown.astype(np.uint8), (wide, high), interpolation=cv2.INTER_NEAREST)
