@@ -13,7 +13,7 @@ import pytest
 from samples.bodies import Patch
 from samples.files import write_clip, write_scene
 from samples.render import draw, far_to_near, frames, shakes
-from samples.road import KINDS, calibration_points, dense, free_flow
+from samples.road import KINDS, calibration_points, dense_low, free_flow
 from samples.scene import FACES, Light, share_inside
 from samples.ship import SAMPLE, shipped_scene
 from samples.visibility import truth_rows
@@ -161,7 +161,7 @@ def test_truth_is_listed_while_half_of_the_box_is_in_the_picture():
 
 
 def test_truth_leaves_out_what_others_hide():
-    scene = dense(1, 8, SMALL)
+    scene = dense_low(1, 8, SMALL)
     together = Counter(number for _, _, number, _ in truth_rows(scene))
     alone = {v.id: len(truth_rows(replace(scene, vehicles=(v,)))) for v in scene.vehicles}
     assert all(together[number] <= frames for number, frames in alone.items())
