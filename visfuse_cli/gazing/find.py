@@ -18,6 +18,7 @@ GAP_S = 0.1  # between the pictures that are compared: what is slow has then mov
 ALIKE = 0.4  # overlap with the region of the frame before
 JOINED = 0.5  # of the narrower one's width: what lies in line, and no further than the higher one is high, is one thing
 KNOWN = 0.2  # overlap with what is followed already
+LARGER, WIDER, HELD = 1.4, 1.6, 0.8  # times the area and, at most, the width of what is followed, and its share inside
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +54,7 @@ class Finder:
         self._candidates = []
 
     def look(self, view: View) -> tuple[list[Array], list[View]]:
-        """Quads (4, 2) px of what moved for some frames and is not followed, and the views from theirs to this one."""
+        """Quads (4, 2) px of what moved for some frames and is not followed, or in part; the views from theirs on."""
         views = self._views
         views.append(view)
         middle = next((k for k, each in enumerate(views) if view.t - each.t <= GAP_S), len(views) - 1)
@@ -85,7 +86,8 @@ class Finder:
         held = [np.append(box[:2], box[:2] + box[2:]) for box in known]
         kept, ready = [], []
         for box, area in regions:
-            if area < least or any(_shared(box, other) > KNOWN for other in held):
+            over = [other for other in held if _shared(box, other) > KNOWN]
+            if area < least or len(over) > 1 or any(not _outgrows(box, other) for other in over):
                 continue
             boxes = [*next((each for each in self._candidates if _shared(each[-1], box) > ALIKE), []), box]
             if len(boxes) < self._config.life.confirm_frames:
@@ -120,6 +122,18 @@ def _above(box: Array, other: Array) -> bool:
     gap = max(box[1], other[1]) - min(box[3], other[3])
     high = max(box[3] - box[1], other[3] - other[1])
     return bool(across > JOINED * min(box[2] - box[0], other[2] - other[0]) and gap < high)
+
+
+def _outgrows(box: Array, held: Array) -> bool:
+    """Whether a box [u0, v0, u1, v1] is the whole of what was followed in part."""
+    (wide, high), (w, h) = box[2:] - box[:2], held[2:] - held[:2]
+    inner = np.clip(np.minimum(box[2:], held[2:]) - np.maximum(box[:2], held[:2]), 0, None)
+    return bool(wide * high > LARGER * w * h and wide < WIDER * w and np.prod(inner) > HELD * w * h)
+
+
+def shared(box: Array, other: Array) -> float:
+    """Overlap of two boxes [x, y, w, h], as a share of the smaller one."""
+    return _shared(*(np.append(each[:2], each[:2] + each[2:]) for each in (box, other)))
 
 
 def _shared(box: Array, other: Array) -> float:

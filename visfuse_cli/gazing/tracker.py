@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numpy as np
+
 from visfuse_cli.gazing import target as one
-from visfuse_cli.gazing.find import Finder, View
+from visfuse_cli.gazing.find import KNOWN, Finder, View, shared
 from visfuse_cli.gazing.head import Head
 from visfuse_cli.gazing.models import Courses
 from visfuse_cli.gazing.target import Expected, Target
@@ -13,6 +15,9 @@ from visfuse_cli.moving.pursuit import Pursuit, Stage
 from visfuse_cli.moving.settings import ImmConfig
 from visfuse_cli.records import Array, GivenTarget, Image
 from visfuse_cli.vision import patches
+from visfuse_cli.vision.boxes import box_of
+
+YOUNG_S = 1.0  # s for which a target may turn out to have been begun in part
 
 
 class Tracker(Pursuit[Target, View, Expected, Array]):
@@ -59,19 +64,33 @@ class Tracker(Pursuit[Target, View, Expected, Array]):
     def _begin_found(self, found: Sequence[Array], since: Sequence[View]) -> None:
         """Begin targets in quads (4, 2) px of the first of some views, and follow them through the others.
 
-        Who was lost or away goes on.
+        Who was lost or away goes on; what was begun in part is begun again as a whole.
         """
         for quad in found:
-            old, own = self._known(since[0], quad)
-            if old is None and self._given:
-                continue  # who is followed was said
-            identity, given = (self._next_id, False) if old is None else (old.id, old.given)
-            place = quad if own is None else own
-            new = one.start(identity, self._head, self._config, self._models, since[0], place, given)
+            part, fresh = self._part_of(quad, since[0])
+            old, own = (None, None) if part is not None else self._known(since[0], quad)
+            if not fresh or (self._given and old is None):
+                continue  # who is followed was said, or is seen well for long
+            identity, given = (old.id, old.given) if old is not None else (self._next_id, False)
+            new = one.start(
+                identity, self._head, self._config, self._models, since[0], quad if own is None else own, given
+            )
             if new is None:
                 continue
-            self._take(new, old)
+            if part is not None:
+                new.id = part.id
+                self._followed[self._followed.index(part)] = new
+            else:
+                self._take(new, old)
             for view in since[1:]:
                 one.follow(new, view, one.expect(new, view), 0.0)
             for view in since:
                 view.known.append(new.looks[-1].box)
+
+    def _part_of(self, quad: Array, view: View) -> tuple[Target | None, bool]:
+        """Who is followed in a part of a quad (4, 2) of a view, if anybody, and whether the quad is to be begun."""
+        for each in self._followed:
+            box = next((look.box for look in each.looks if look.frame == view.frame), None)
+            if box is not None and np.isfinite(box).all() and shared(box, box_of(quad)) > KNOWN:
+                return each, not each.given and view.t - each.looks[0].t < YOUNG_S
+        return None, True
