@@ -1,4 +1,4 @@
-"""Moving heads: `python benchmarks/moving.py --seeds 10 [--keep DIR] [--only visits crossings still street gaze speed]`
+"""Moving heads: `python benchmarks/moving.py --seeds 10 [--keep DIR] [--only visits crossings still street gaze meeting speed memory]`
 
 Rendered rooms (a target 3-6 m away that goes straight, turns and leaves; two people who cross; nobody at all), the
 recorded street, rendered pan-tilt heads, and the CPU time of each frame with the video written, all through the real
@@ -30,7 +30,7 @@ Array = NDArray[np.float64]
 STREET = Path(__file__).parents[2] / "shared" / "data" / "imm-street"
 MODELS = ("imm", "drifting", "cv", "ca", "periodic")
 TURNING = 0.25  # rad/s of the true course, from which on a target turns
-PARTS = ("visits", "crossings", "still", "street", "gaze", "speed")
+PARTS = ("visits", "crossings", "still", "street", "gaze", "meeting", "speed", "memory")
 
 
 def main() -> None:

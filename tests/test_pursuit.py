@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from samples.head import room
+from visfuse_cli.gazing import find
 from visfuse_cli.moving.pursuit import Pursuit
 from visfuse_cli.moving.settings import ImmConfig
 from visfuse_cli.moving.tracker import TWINS_S, Tracker
@@ -129,3 +130,11 @@ def test_two_targets_in_one_place_that_go_alike_are_one_and_the_older_stays():
     assert [tracker._twin(each, 1.1 * TWINS_S) for each in tracker._followed] == [False, True, False]
     twin.given = True
     assert not tracker._twin(twin, 2 * TWINS_S)
+
+
+def test_what_was_first_seen_in_part_gives_way_to_the_whole():
+    held = np.array([10.0, 30, 30, 50])
+    assert find._outgrows(np.array([9.0, 10, 31, 52]), held)
+    assert not find._outgrows(np.array([9.0, 29, 31, 52]), held)  # as large as it
+    assert not find._outgrows(np.array([9.0, 10, 61, 52]), held)  # two side by side
+    assert not find._outgrows(np.array([22.0, 10, 42, 52]), held)  # somebody else
