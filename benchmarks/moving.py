@@ -1,8 +1,9 @@
-"""Moving heads: `python benchmarks/moving.py --seeds 10 [--keep DIR] [--only visits crossings still street gaze meeting speed memory]`
+"""Moving heads: `python benchmarks/moving.py --seeds 10 [--first 0] [--keep DIR] [--only PART ...]`
 
-Rendered rooms (a target 3-6 m away that goes straight, turns and leaves; two people who cross; nobody at all), the
-recorded street, rendered pan-tilt heads, and the CPU time of each frame with the video written, all through the real
-command. `--keep` keeps the rendered scenes, and takes those that are there.
+Rendered rooms (a target 3-6 m away that goes straight, turns and leaves; two people who cross; nobody at all, seen by
+unlike cameras), the recorded street, rendered pan-tilt heads (one walker; three people who meet), the CPU time of each
+frame with the video written, and memory over length, all through the real command. `--first` is the first seed; `--keep`
+keeps the rendered scenes, and takes those that are there; `--fps` renders the rooms at another rate.
 """
 
 from __future__ import annotations
@@ -15,6 +16,8 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable
+from dataclasses import replace
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -23,8 +26,8 @@ from numpy.typing import NDArray
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from samples.gaze import write_gaze, yard
-from samples.head import room, visit, write_head
+from samples.gaze import GazeScene, three, write_gaze, yard
+from samples.head import HeadScene, Walk, room, visit, write_head
 
 Array = NDArray[np.float64]
 STREET = Path(__file__).parents[2] / "shared" / "data" / "imm-street"
@@ -36,17 +39,19 @@ PARTS = ("visits", "crossings", "still", "street", "gaze", "meeting", "speed", "
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seeds", type=int, default=10)
+    parser.add_argument("--first", type=int, default=0)
+    parser.add_argument("--fps", type=int, default=15, help="frame rate of the visits")
     parser.add_argument("--keep", type=Path)
     parser.add_argument("--causal", action="store_true", help="every model on the turn without the backward pass, too")
     parser.add_argument("--only", nargs="*", choices=PARTS, default=PARTS)
     args = parser.parse_args()
     with tempfile.TemporaryDirectory() as temporary:
-        folder = args.keep or Path(temporary)
+        folder, seeds = args.keep or Path(temporary), range(args.first, args.first + args.seeds)
         for part in args.only:
             if part == "visits":
-                visits(folder, args.seeds, ("smooth=true", "smooth=false") if args.causal else ("smooth=true",))
+                visits(folder, seeds, ("smooth=true", "smooth=false") if args.causal else ("smooth=true",), args.fps)
             else:
-                globals()[part](folder, args.seeds)
+                globals()[part](folder, seeds)
 
 
 def rendered(folder: Path, write: Callable[[Path], None]) -> Path:
@@ -113,7 +118,7 @@ def rms(values: Array) -> float:
     return float(np.sqrt(np.mean(np.sum(values**2, axis=-1)))) if len(values) else float("nan")
 
 
-def turning(true: dict[int, Array], frames: list[int], fps: float = 15.0) -> NDArray[np.bool_]:
+def turning(true: dict[int, Array], frames: list[int], fps: float) -> NDArray[np.bool_]:
     """Whether the target's course turns at those frames."""
     every = sorted(true)
     course = np.unwrap([np.arctan2(true[k][5], true[k][3]) for k in every])
@@ -121,14 +126,15 @@ def turning(true: dict[int, Array], frames: list[int], fps: float = 15.0) -> NDA
     return np.array([rate[k] > TURNING for k in frames])
 
 
-def visits(folder: Path, seeds: int, modes: tuple[str, ...]) -> None:
+def visits(folder: Path, seeds: range, modes: tuple[str, ...], fps: int) -> None:
     print(f"\n{'visit':<7} {'':<5} {'tracks':>6} {'frames':>8} {'RMSE m':>7} {'% range':>8} {'speed m/s':>9}")
     turns: dict[str, list[Array]] = {name + mode: [] for name in MODELS for mode in modes}
     worst = np.zeros(2)
-    for seed in range(seeds):
-        scene = rendered(folder / f"visit{seed}", lambda out, seed=seed: write_head(visit(seed), out, init=True))
+    for seed in seeds:
+        name = f"visit{seed}" if fps == 15 else f"visit{seed}at{fps}"
+        scene = rendered(folder / name, lambda out, seed=seed: write_head(at_rate(visit(seed), fps), out, init=True))
         true = truth(scene)[1]
-        for name, where in (("init", scene), ("bare", without_init(scene, folder / f"visit{seed}-bare"))):
+        for name, where in (("init", scene), ("bare", without_init(scene, folder / f"{name}-bare"))):
             tracks = wheels(where)[0]["tracks"]
             best = max(tracks, key=lambda t: len(t["states"]), default={"states": []})
             frames, off, at = errors(best, true, 3)
@@ -142,16 +148,20 @@ def visits(folder: Path, seeds: int, modes: tuple[str, ...]) -> None:
                 tracks = wheels(scene, "--set", f"filter.kind={name}", "--set", mode)[0]["tracks"]
                 if tracks:
                     frames, off, _ = errors(tracks[0], true, 3)
-                    turns[name + mode].append(off[turning(true, frames), :3])
+                    turns[name + mode].append(off[turning(true, frames, fps), :3])
     print(f"worst: {worst[0]:.2f} % of the range, {worst[1]:.3f} m/s")
     for mode in modes:
         values = {name: rms(np.concatenate(turns[name + mode])) for name in MODELS}
         print(f"on the turn, {mode}, RMS m: " + ", ".join(f"{name} {value:.4f}" for name, value in values.items()))
 
 
-def crossings(folder: Path, seeds: int) -> None:
+def at_rate(scene: HeadScene, fps: int) -> HeadScene:
+    return replace(scene, fps=Fraction(fps), n_frames=int(scene.n_frames * fps / float(scene.fps)))
+
+
+def crossings(folder: Path, seeds: range) -> None:
     print(f"\n{'crossing':<9} {'':<5} {'tracks':>6} {'exchanged':>9} {'RMSE m':>7} {'speed m/s':>9}")
-    for seed in range(seeds):
+    for seed in seeds:
         scene = rendered(folder / f"two{seed}", lambda out, seed=seed: write_head(room(seed, people=2), out, init=True))
         true = truth(scene)
         for name, where in (("init", scene), ("bare", without_init(scene, folder / f"two{seed}-bare"))):
@@ -176,17 +186,26 @@ def crossings(folder: Path, seeds: int) -> None:
             )
 
 
-def still(folder: Path, seeds: int) -> None:
+# Size px, frames/s, baseline m, mean speed and swing m/s, turning rate and swing rad/s with its period s.
+CAMERAS = (
+    ((256, 220), 15, 0.18, (0.2, 0.08), (0.02, 0.1, 4.0)),
+    ((320, 240), 30, 0.10, (0.3, 0.1), (0.0, 0.15, 3.0)),
+    ((640, 480), 10, 0.30, (0.2, 0.08), (-0.03, 0.1, 4.0)),
+    ((256, 220), 5, 0.18, (0.2, 0.08), (0.02, 0.08, 4.0)),
+    ((256, 220), 15, 0.20, (0.5, 0.2), (0.2, 0.25, 3.0)),
+)
+
+
+def still(folder: Path, seeds: range) -> None:
     print("\nstill rooms")
-    for seed in range(min(seeds, 4)):
-        scene = rendered(
-            folder / f"still{seed}",
-            lambda out, seed=seed: write_head(room(seed + 20, still=True, seconds=5.0), out),
-        )
-        print(f"{seed}: {len(wheels(scene)[0]['tracks'])} targets")
+    for seed in seeds:
+        size, fps, baseline, speed, turn = CAMERAS[seed % len(CAMERAS)]
+        head = replace(room(seed, still=True, seconds=5.0, size=size), baseline=baseline, speed=speed, turn=turn)
+        scene = rendered(folder / f"still{seed}", lambda out, head=head, fps=fps: write_head(at_rate(head, fps), out))
+        print(f"{seed}: {size[0]}x{size[1]}, {fps} frames/s: {len(wheels(scene)[0]['tracks'])} targets", flush=True)
 
 
-def street(folder: Path, seeds: int) -> None:
+def street(folder: Path, seeds: range) -> None:
     if not STREET.is_dir():
         print("\nstreet: the recordings lie beside the project; they are not here")
         return
@@ -201,19 +220,19 @@ def street(folder: Path, seeds: int) -> None:
     print(f"street without init.yaml: {len(bare)} targets")
 
 
-def gaze(folder: Path, seeds: int) -> None:
+def surveyed(folder: Path, scene: GazeScene, angle_noise: float) -> Path:
+    """A rendered pan-tilt scene with its homography."""
+    rendered(folder, lambda out: write_gaze(scene, out, angle_noise=angle_noise))
+    if not (folder / "homography.json").is_file():
+        survey = ["calibrate-homography", "--gaze", str(folder / "gaze.csv"), "--out", str(folder / "homography.json")]
+        subprocess.run([sys.executable, "-m", "visfuse_cli", "-q", *survey], check=True)
+    return folder
+
+
+def gaze(folder: Path, seeds: range) -> None:
     print(f"\n{'pan-tilt':<9} {'tracks':>6} {'frames':>8} {'RMSE m':>7} {'% range':>8} {'2D mrad':>8} {'3D mrad':>8}")
-    for seed in range(min(seeds, 5)):
-        scene = rendered(folder / f"gaze{seed}", lambda out, seed=seed: write_gaze(yard(seed), out, angle_noise=2e-4))
-        if not (scene / "homography.json").is_file():
-            survey = [
-                "calibrate-homography",
-                "--gaze",
-                str(scene / "gaze.csv"),
-                "--out",
-                str(scene / "homography.json"),
-            ]
-            subprocess.run([sys.executable, "-m", "visfuse_cli", "-q", *survey], check=True)
+    for seed in seeds[:5]:
+        scene = surveyed(folder / f"gaze{seed}", yard(seed), 2e-4)
         tracks, document, _ = run(scene, "--config", "pan-tilt", "--set", "target.height=0.85")
         head, true = np.array(document["head"]["position"]), truth(scene)[1]
         best = max(tracks["tracks"], key=lambda t: len(t["states"]))
@@ -222,10 +241,30 @@ def gaze(folder: Path, seeds: int) -> None:
         share = 100 * np.sqrt(np.mean(np.sum(off[:, :2] ** 2, 1) / far**2))
         plane, ground = (1e3 * best["summary"][f"prediction_rms_{kind}"] for kind in ("2d", "3d"))
         row = f"{len(tracks['tracks']):6d} {len(frames):4d}/{len(true):<3d} {rms(off[:, :2]):7.3f} {share:8.2f}"
-        print(f"{seed:<9} {row} {plane:8.2f} {ground:8.2f}")
+        print(f"{seed:<9} {row} {plane:8.2f} {ground:8.2f}", flush=True)
 
 
-def speed(folder: Path, seeds: int) -> None:
+def meeting(folder: Path, seeds: range) -> None:
+    """Three people who meet before a pan-tilt head: each track's owners, and its error against the first."""
+    print(f"\n{'meeting':<9} {'tracks':>6}  of whom, frames, RMSE m")
+    for seed in seeds[:5]:
+        scene = surveyed(folder / f"three{seed}", three(seed), 0.0)
+        tracks, true = run(scene, "--config", "pan-tilt", "--set", "target.height=0.85")[0]["tracks"], truth(scene)
+        told = []
+        for track in tracks:
+            near = [
+                min((float(np.hypot(*(np.array(s["position"]) - t[s["frame"]][:2]))), k) for k, t in true.items())
+                for s in track["states"]
+                if all(s["frame"] in t for t in true.values())
+            ]
+            owners = [k for _, k in near]
+            first = max(set(owners), key=owners.count)
+            off = errors(track, true[first], 2)[1][:, :2]
+            told.append(f"{first} ({owners.count(first)}/{len(owners)}, {rms(off):.2f})")
+        print(f"{seed:<9} {len(tracks):6d}  " + ", ".join(told), flush=True)
+
+
+def speed(folder: Path, seeds: range) -> None:
     print(f"\n{'CPU ms a pair, video written':<40} {'all':>6} {'goal on two cores':>18}")
     for name, size, method, rate in (("256x220", (256, 220), "horn-schunck", 15), ("320x240", (320, 240), "dis", 30)):
         scene = rendered(folder / f"speed{name}", lambda out, size=size: write_head(visit(1, size=size), out))
@@ -233,6 +272,27 @@ def speed(folder: Path, seeds: int) -> None:
         whole = wheels(scene, "--set", f"flow.method={method}", video=True)
         pairs = whole[1]["counts"]["frames"] - start[1]["counts"]["frames"]
         print(f"{name + ' ' + method:<40} {1e3 * (whole[2] - start[2]) / pairs:6.1f} {2e3 / rate:18.1f}")
+
+
+def memory(folder: Path, seeds: range) -> None:
+    """Peak memory of the whole command, video written, on one clip and on ten times its frames."""
+    print("\nmemory")
+    for seconds in (4.0, 40.0):
+        scene = rendered(folder / f"long{seconds:.0f}", lambda out, seconds=seconds: write_head(lap(seconds), out))
+        with tempfile.TemporaryDirectory() as out:
+            command = [sys.executable, "-m", "visfuse_cli", "-q", "track-imm", str(scene), "--out", out + "/run"]
+            code = "import resource, subprocess, sys; subprocess.run(sys.argv[1:], check=True)\n"
+            code += "print(resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss)"
+            peak = subprocess.run([sys.executable, "-c", code, *command], capture_output=True, text=True, check=True)
+        print(f"{round(15 * seconds)} frames: {int(peak.stdout) / 1024:.0f} MB", flush=True)
+
+
+def lap(seconds: float) -> HeadScene:
+    """Somebody who walks to and fro before a head that turns to and fro."""
+    t = np.arange(0, seconds + 2, 0.5)
+    places = np.column_stack([np.sin(0.8 * t), 4.5 + 0.3 * np.cos(0.5 * t)])
+    scene = room(3, still=True, seconds=seconds)
+    return replace(scene, walks=(Walk(t, places, 30),), speed=(0.0, 0.05), turn=(0.0, 0.05, 4.0))
 
 
 if __name__ == "__main__":
