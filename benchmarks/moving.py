@@ -131,10 +131,10 @@ def visits(folder: Path, seeds: range, modes: tuple[str, ...], fps: int) -> None
     turns: dict[str, list[Array]] = {name + mode: [] for name in MODELS for mode in modes}
     worst = np.zeros(2)
     for seed in seeds:
-        name = f"visit{seed}" if fps == 15 else f"visit{seed}at{fps}"
-        scene = rendered(folder / name, lambda out, seed=seed: write_head(at_rate(visit(seed), fps), out, init=True))
+        place = f"visit{seed}" if fps == 15 else f"visit{seed}at{fps}"
+        scene = rendered(folder / place, lambda out, seed=seed: write_head(at_rate(visit(seed), fps), out, init=True))
         true = truth(scene)[1]
-        for name, where in (("init", scene), ("bare", without_init(scene, folder / f"{name}-bare"))):
+        for name, where in (("init", scene), ("bare", without_init(scene, folder / f"{place}-bare"))):
             tracks = wheels(where)[0]["tracks"]
             best = max(tracks, key=lambda t: len(t["states"]), default={"states": []})
             frames, off, at = errors(best, true, 3)
