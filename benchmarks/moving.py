@@ -2,8 +2,8 @@
 
 Rendered rooms (a target 3-6 m away that goes straight, turns and leaves; two people who cross; nobody at all, seen by
 unlike cameras), the recorded street, rendered pan-tilt heads (one walker; three people who meet), the CPU time of each
-frame with the video written, and memory over length, all through the real command. `--first` is the first seed; `--keep`
-keeps the rendered scenes, and takes those that are there; `--fps` renders the rooms at another rate.
+frame with the video written, and memory over length, all through the real command. `--first` is the first seed,
+`--keep` keeps the rendered scenes and takes those that are there, `--fps` renders the rooms at another rate.
 """
 
 from __future__ import annotations
