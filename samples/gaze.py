@@ -111,9 +111,9 @@ def three(seed: int, *, size: tuple[int, int] = (384, 288)) -> GazeScene:
     rng = np.random.default_rng((seed, 44))
     side, t = 1.0 if rng.random() < 0.5 else -1.0, np.array([0, 2.5, 5.0])
     a, b, c = rng.uniform(-0.3, 0.3, 3)
-    ways = ([[-3, 10 + a], [0, 10.2], [3, 10.4 + a]], [[3, 11.8 + b], [0, 11.6], [-3, 11.4 + b]])
-    ways = (*ways, [[-1.5, 13.5 + c], [0.2, 13.3], [1.9, 12.9 + c]])
-    walks = tuple(Walk(t, np.array(way) * [side, 1.0], seed * 10 + k) for k, way in enumerate(ways, start=1))
+    ways = [[-3, 10 + a], [0, 10.2], [3, 10.4 + a]], [[3, 11.8 + b], [0, 11.6], [-3, 11.4 + b]]
+    behind = [[-1.5, 13.5 + c], [0.2, 13.3], [1.9, 12.9 + c]]
+    walks = tuple(Walk(t, np.array(way) * [side, 1.0], seed * 10 + k) for k, way in enumerate((*ways, behind), start=1))
     return replace(yard(seed, seconds=5.0, size=size, follow=False), walks=walks)
 
 
