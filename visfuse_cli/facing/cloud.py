@@ -2,22 +2,41 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
 from visfuse_cli.facing import free
-from visfuse_cli.facing.front import LATERAL, SIZE, VERTICAL, S, Target, V, corners, drift, expected
+from visfuse_cli.facing.front import (
+    FACING_FOUND,
+    LATERAL,
+    SIZE,
+    VERTICAL,
+    S,
+    Shape,
+    Target,
+    V,
+    corners,
+    drift,
+    expected,
+    middle,
+    shape_of,
+)
 from visfuse_cli.facing.settings import StereoConfig
 from visfuse_cli.maths import gaussian, particles
 from visfuse_cli.maths.paths import Way
 from visfuse_cli.maths.planes import triangulated
-from visfuse_cli.records import Array, Gaussian
+from visfuse_cli.records import Array, Gaussian, StereoRig
+from visfuse_cli.vision.patches import log_height
 
+LATELY_S, AHEAD = 0.5, 20.0  # of the looks that tell a course; how many times as far the course is thought to go on
+ASTRAY = 0.9  # cosine of a course to the provisional way, below which that was wrong
 AGAIN = 0.55  # of the effective number: below, the particles are drawn anew
 JITTER = 0.5  # of the optimal kernel's width
 FOUND_SHARE = 0.4  # how far the speed of what was found unaided may be off
 DEPTH_PX = 0.5  # deviation of the disparity of quads that were given
-USUAL_SIGMA = 0.15  # m/s a frame at 5 frames/s
+USUAL_SIGMA, USUAL_DEPTH = 0.15, 20.0  # m/s a frame at 5 frames/s, of what is that far away (m) or farther
 STRAYED = 60.0  # squared deviations of the cloud from the patch that was found
 BLUR_PX, BLUR_STRETCH = 0.3, 0.01  # which is not thought of as strayed
 USUAL = 4.0  # measurements that the stated noise stands for
@@ -29,14 +48,24 @@ ROUNDS, STEP, NUGGET = (
 )  # of the proposal: iterations; deviations of its numerical derivative; of its variances
 
 
-def speeds(speed: float | None, given: bool, config: StereoConfig, count: int, rng: np.random.Generator) -> Array:
-    """Speeds (count,) m/s to begin with: either way along the path where the direction is not known."""
+def speeds(
+    speed: float | None, doubt: float | None, config: StereoConfig, count: int, rng: np.random.Generator
+) -> Array:
+    """Speeds (count,) m/s to begin with: either way along the path where the direction is not known.
+
+    `doubt` (m/s): how far the speed of what was found unaided may be off; None where it was given.
+    """
     if speed is None:
         return np.asarray(rng.uniform(-1, 1, count) * config.filter.start_speed)
-    if not given:
-        return np.asarray(speed * (1 + FOUND_SHARE * rng.normal(size=count)))
+    if doubt is not None:
+        return np.asarray(rng.normal(speed, np.hypot(FOUND_SHARE * speed, doubt), count))
     sign = np.where(np.arange(count) % 2 == 0, 1.0, -1.0)
     return np.asarray(sign * (speed + rng.normal(0, config.filter.speed_share * abs(speed), count)))
+
+
+def depths(rig: StereoRig, depth: float, count: int, rng: np.random.Generator) -> Array:
+    """By what shares (count,) a front at `depth` (m) may be farther off than its quads say."""
+    return np.clip(rng.normal(0, depth / (rig.left.K[0, 0] * rig.baseline) * DEPTH_PX, count), -0.5, 0.5)
 
 
 def along_sight(way: Way, state: Array, place: Array, depth: Array) -> Array:
@@ -57,19 +86,27 @@ def predict(target: Target, t: float) -> None:
     dt = t - target.t
     if dt <= 0:
         return
-    settings, states = target.config.filter, target.states
+    states = target.states
     target.t = t
     if target.free:
         noise = target.rng.normal(size=(len(states), 6))
-        target.states = free.advanced(states, dt, settings.sigma_v or USUAL_SIGMA, target.free_drift, noise)
+        target.states = free.advanced(states, dt, sigma_v(target), target.free_drift, noise)
         return
     root = float(np.sqrt(5 * dt))  # the deviations belong to frames 0.2 s apart
     noise = target.rng.normal(size=(len(states), 3)) * root
     lateral, vertical = drift(target)
     states[:, S] += states[:, V] * dt
-    states[:, V] += (settings.sigma_v or USUAL_SIGMA) * noise[:, 0]
+    states[:, V] += sigma_v(target) * noise[:, 0]
     states[:, LATERAL] += lateral * noise[:, 1]
     states[:, VERTICAL] += vertical * noise[:, 2]
+
+
+def sigma_v(target: Target) -> float:
+    """Deviation of the speed, m/s a frame at 5 frames/s; what is near and fills the picture is small, and slower."""
+    if target.config.filter.sigma_v is not None:
+        return target.config.filter.sigma_v
+    depth = float(corners(target, target.mean)[:, 2].mean())
+    return USUAL_SIGMA * float(np.clip(depth / USUAL_DEPTH, 1e-3, 1.0))
 
 
 def forward(target: Target) -> NDArray[np.bool_]:
@@ -101,7 +138,7 @@ def take_in(target: Target) -> None:
     expect = particles.moments(expected(target, target.states), target.log_weights)
     residual = look.z - expect.mean
     blur = np.diag([BLUR_PX**2, BLUR_PX**2, BLUR_STRETCH**2, BLUR_PX**2, BLUR_PX**2])
-    if not residual @ np.linalg.solve(expect.cov + look.R + blur, residual) < STRAYED:
+    if not residual @ np.linalg.solve(expect.cov + look.R + blur, residual) < STRAYED or astray(target):
         gather(target)
         return
     # The stated noise, made larger where the measurements so far were farther off than it allows.
@@ -156,23 +193,76 @@ def shift(target: Target, pixels: Array, stretch: float) -> None:
 
 
 def gather(target: Target) -> None:
-    """Put particles that have strayed where the patch was found, at the speed between the last two looks."""
-    looks, way = target.looks[-2:], target.way
-    points = [triangulated(target.rig, each.z[:2], each.z[3:]) for each in looks]
-    dt = looks[-1].t - looks[0].t
-    state, far = target.mean.copy(), points[-1][2]
+    """Put particles that have strayed where the patch was found, at the speed of the latest looks."""
+    last = target.looks[-1]
+    looks = [each for each in target.looks if each.t >= last.t - LATELY_S] if len(target.looks) > 2 else target.looks
+    points = [triangulated(target.rig, each.z[:2], each.z[3:]) for each in (looks[0], last)]
+    dt, moved, far = last.t - looks[0].t, points[1] - points[0], points[1][2]
+    swift = float(np.hypot(0.2 * np.linalg.norm(moved), 0.01 * far)) / max(dt, 1e-3)
+    if not target.on_path and not target.free:
+        _turn(target, points)
+    state = target.mean.copy()
     if target.free:
-        state[free.MIDDLE] = points[-1]
-        state[free.VELOCITY] = (points[-1] - points[0]) / dt if dt else state[free.VELOCITY]
-        swift = 0.2 * float(np.linalg.norm(state[free.VELOCITY]))
+        state[free.MIDDLE] = points[1]
+        state[free.VELOCITY] = moved / dt if dt else state[free.VELOCITY]
         sigma = np.array([0.002 * far, 0.002 * far, 0.01 * far, *[0.01] * 3, *[swift] * 3, *[0.05] * 3, 0.01])
     else:
-        s = [way.nearest(point) for point in points]
-        place, axes = way.frame(np.array(s[-1]))
-        off = (points[-1] - place) @ axes
-        state[[S, LATERAL, VERTICAL]] = s[-1], off[1], off[2]
-        state[V] = (s[-1] - s[0]) / dt if dt else 0.0
-        sigma = np.array([0.01 * far, 0.2 * abs(state[V]), 0.002 * far, 0.002 * far, 0.01])
-    state[-1] += looks[-1].z[2] - expected(target, state)[2]
+        s = [target.way.nearest(point) for point in points]
+        place, axes = target.way.frame(np.array(s[1]))
+        off = (points[1] - place) @ axes
+        state[[S, LATERAL, VERTICAL]] = s[1], off[1], off[2]
+        state[V] = (s[1] - s[0]) / dt if dt else state[V]
+        sigma = np.array([0.01 * far, swift, 0.002 * far, 0.002 * far, 0.01])
+    state[-1] += last.z[2] - expected(target, state)[2]
     target.states = state + sigma * target.rng.normal(size=target.states.shape)
     target.log_weights = np.full(len(target.states), -np.log(len(target.states)))
+
+
+def astray(target: Target) -> bool:
+    """Whether what has no path of its own turns out to go elsewhere than was thought when it was found."""
+    if target.on_path or target.free or len(target.looks) < 2:
+        return False
+    last = target.looks[-1]
+    first = next(each for each in target.looks if each.t >= last.t - LATELY_S)
+    points = [triangulated(target.rig, each.z[:2], each.z[3:]) for each in (first, last)]
+    moved = points[1] - points[0]
+    way, noise = float(np.linalg.norm(moved)), 0.01 * points[1][2]
+    along = abs(target.way.frame(target.mean[S])[1][:, 0] @ moved)
+    return bool(way > 5 * noise and along < ASTRAY * way)
+
+
+def _turn(target: Target, points: list[Array]) -> None:
+    """Lay a provisional way through two points (3,) m; the front keeps its place in space."""
+    if np.linalg.norm(points[1] - points[0]) < NUGGET * points[1][2]:
+        return
+    before = target.way.frame(target.mean[S])[1]
+    ahead = points[1] + AHEAD * (points[1] - points[0])
+    target.way = Way(np.stack([points[0], ahead]))
+    after = target.way.frame(np.array(0.0))[1]
+    target.shape = Shape(target.shape.corners @ before.T @ after)
+
+
+def again(target: Target, way: Way) -> Target:
+    """The same measurements taken in once more along a way that is known now, from the first one on."""
+    count, first = len(target.states), target.looks[0]
+    place = triangulated(target.rig, first.z[:2], first.z[3:])
+    shape, state = shape_of(target.rig, way, first.quads["left"], float(place[2]), FACING_FOUND)
+    states = along_sight(way, state, middle(way, state), depths(target.rig, float(place[2]), count, target.rng))
+    before = target.causal[0][2]
+    states[:, V] = target.rng.normal(before.mean[V], np.sqrt(before.cov[V, V]), count)
+    even = np.full(count, -np.log(count))
+    other = replace(
+        target, way=way, shape=shape, states=states, log_weights=even, t=first.t, on_path=True, looks=[], nis=[]
+    )
+    other.causal, looks = [], {look.frame: look for look in target.looks}
+    for frame, t, _, seen in target.causal:
+        predict(other, t)
+        if seen:
+            other.looks.append(looks[frame])
+            take_in(other)
+        other.causal.append((frame, t, particles.moments(other.states, other.log_weights), seen))
+        draw(other, AGAIN)
+        if seen:  # the patch was moved and stretched after it was measured
+            quad, z = looks[frame].quads["left"], looks[frame].z
+            shift(other, quad.mean(axis=0) - z[:2], float(log_height(quad) - z[2]))
+    return other

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from visfuse_cli.facing import free
+from visfuse_cli.facing import cloud, free
 from visfuse_cli.facing.adjust import ALONG, RIGHT, SPEED, UP, Adjusted, Rules, Sightings, adjust, slopes
 from visfuse_cli.facing.front import FACING, LATERAL, VERTICAL, S, Target, V, drift
 from visfuse_cli.maths.paths import Way, through
@@ -103,14 +103,13 @@ def _moved(target: Target, settled: Settled) -> bool:
 
 
 def _with_way(target: Target) -> Target:
-    """The same measurements along the path that they themselves lie on."""
+    """The same measurements, taken in along the path that they themselves lie on."""
     rig = target.rig
     z = np.stack([look.z for look in target.looks])
     points = triangulated(rig, z[:, :2], z[:, 3:])
     spread = np.array([look.R[3, 3] + look.R[0, 0] - 2 * look.R[0, 3] for look in target.looks])
     sigma = points[:, 2] ** 2 / (rig.left.K[0, 0] * rig.baseline) * np.sqrt(spread + 0.05**2)
-    way = through(points, sigma, 25.0)
-    return replace(target, way=way, on_path=True)
+    return cloud.again(target, through(points, sigma, 25.0))
 
 
 def _sightings(target: Target, t: Array) -> Sightings:

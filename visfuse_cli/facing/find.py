@@ -13,6 +13,7 @@ from visfuse_cli.vision.background import FOREGROUND, Background
 
 OVERLAP = 0.2  # share of a region that a vehicle which is followed already may hold
 LEAST_MOVE = 0.02  # of its size, that a region must have moved or grown
+EDGE_PX = 1.5  # of a region: how far its sides may be off
 DENSE = 0.6  # share of the fullest row or column
 MEMORY_S, SHADOW = 60.0, 0.5
 
@@ -27,11 +28,14 @@ class _Candidate:
 
 @dataclass(frozen=True, slots=True)
 class Found:
-    """A region that moves: its left quad (4, 2) px, how fast its middle moves (2,) px/s, and its growth (1/s)."""
+    """A region that moves: its left quad (4, 2) px, how fast its middle moves (2,) px/s, its growth (1/s), and the
+    deviation of that.
+    """
 
     quad: Array
     motion: Array
     growth: float
+    growth_sigma: float
 
     def velocity(self, rig: StereoRig, place: Array) -> Array:
         """Velocity (3,) m/s of what stands at a place (3,) m."""
@@ -96,7 +100,8 @@ class Finder:
         old, new = candidate.first, candidate.box
         moved = ((new[:2] + new[2:]) - (old[:2] + old[2:])) / 2
         grown = 0.5 * float(np.log(np.prod(new[2:] - new[:2]) / np.prod(old[2:] - old[:2])))
-        return Found(self._quad(new), moved / dt, grown / dt)
+        doubt = EDGE_PX / float(np.sqrt(np.prod(old[2:] - old[:2])))
+        return Found(self._quad(new), moved / dt, grown / dt, doubt / dt)
 
     def _quad(self, box: Array) -> Array:
         """The corners of a region less its rim, where background shows."""

@@ -144,4 +144,5 @@ def drift(target: Target) -> tuple[float, float]:
     settings = target.config.filter
     if target.on_path:
         return settings.sigma_lateral, settings.sigma_vertical
-    return target.free_drift, target.free_drift / 2
+    most = max(target.free_drift, settings.free_share * 0.2 * abs(float(target.mean[V])))
+    return most, most / 2

@@ -29,20 +29,22 @@ def start(
     speed: float | None,
     at: tuple[int, float],
     seed: int,
-    given: bool,
+    doubt: float | None,
     on_path: bool,
 ) -> Target | None:
-    """Begin with a front seen in left and right quads (4, 2) px at (frame, t); None where it is behind the cameras."""
-    left, right = quads
+    """Begin with a front seen in left and right quads (4, 2) px at (frame, t); None where it is behind the cameras.
+
+    `doubt` (m/s): how far `speed` may be off where the front was found unaided; None where it was given.
+    """
+    (left, right), given = quads, doubt is None
     place = triangulated(rig, left.mean(axis=0), right.mean(axis=0))
     if not np.isfinite(place).all() or place[2] <= 0.1:
         return None
     shape, state = shape_of(rig, way, left, float(place[2]), FACING if given else FACING_FOUND)
     rng = np.random.default_rng((seed, identity))
     count, unbound = config.filter.particles, not config.filter.path_constraint
-    sigma_depth = place[2] / (rig.left.K[0, 0] * rig.baseline) * cloud.DEPTH_PX  # as a share of the depth
-    depth = np.clip(rng.normal(0, sigma_depth, count), -0.5, 0.5)
-    speeds = cloud.speeds(speed, given, config, count, rng)
+    depth = cloud.depths(rig, float(place[2]), count, rng)
+    speeds = cloud.speeds(speed, doubt, config, count, rng)
     centre = middle(way, state)
     if unbound:
         axes = way.frame(state[0])[1]

@@ -151,7 +151,7 @@ def _begin_given(
         right = match(scene.rig, views, given.left, config.observation.good)
     begun = None
     if right is not None:
-        begun = _begin(identity, given.left, right, given.speed, scene, config, views, at, seed, True)
+        begun = _begin(identity, given.left, right, given.speed, scene, config, views, at, seed)
     if begun is None:
         run_.warn(f"target {identity} of init.yaml was not found in the right view at frame {at[0]}")
     return begun
@@ -175,13 +175,13 @@ def _begin_found(
     if not np.isfinite(place).all() or place[2] <= 0.1:
         return None
     velocity = found.velocity(scene.rig, place)
-    speed = max(float(np.linalg.norm(velocity)), 1e-3)
+    speed, doubt = max(float(np.linalg.norm(velocity)), 1e-3), found.growth_sigma * float(place[2])
     way = scene.way if config.filter.path_constraint else None
     if way is None:
         way = Way(np.stack([place, place + AHEAD_S * max(speed, 0.1) * velocity / speed]))
-        return target.start(identity, scene.rig, way, config, views, (left, right), speed, at, seed, False, False)
+        return target.start(identity, scene.rig, way, config, views, (left, right), speed, at, seed, doubt, False)
     along = float(way.frame(np.array(way.nearest(place)))[1][:, 0] @ velocity)
-    return target.start(identity, scene.rig, way, config, views, (left, right), along, at, seed, False, True)
+    return target.start(identity, scene.rig, way, config, views, (left, right), along, at, seed, doubt, True)
 
 
 def _begin(
@@ -194,7 +194,6 @@ def _begin(
     views: dict[str, list[Grey]],
     at: tuple[int, float],
     seed: int,
-    given: bool,
 ) -> Target | None:
     """A target on the scene's path, or on one straight at the camera until its track tells better."""
     way = scene.way if config.filter.path_constraint else None
@@ -204,7 +203,7 @@ def _begin(
         if not np.isfinite(place).all() or place[2] <= 0.1:
             return None
         way = Way(np.stack([place, place - [0, 0, AHEAD_M]]))
-    return target.start(identity, scene.rig, way, config, views, (left, right), speed, at, seed, given, on_path)
+    return target.start(identity, scene.rig, way, config, views, (left, right), speed, at, seed, None, on_path)
 
 
 def _over(target: Target, scene: Scene, t: float) -> bool:
