@@ -18,6 +18,7 @@ DRAWN_PX = 0.1  # how well the lines of a path are drawn
 SLOPE = 0.3  # of a road, in the left camera's axes
 FINE = 400
 FARTHEST = 1e4  # m
+SPARE = 4  # points beyond a bend's degree, so that it is told by more than their noise
 
 
 class Way:
@@ -179,8 +180,8 @@ def through(points: Array, sigma: Array, roughness: float) -> Way:
     if along[-1] < along[0]:
         along, axes = -along, -axes
     degree = 1
-    if len(points) >= 12:
-        for trial in (2, 3):
+    for trial in (2, 3, 4):
+        if len(points) >= trial + SPARE:
             fit = np.polynomial.polynomial.polyfit(along, points, trial, w=np.sqrt(weight))
             line = np.polynomial.polynomial.polyfit(along, points, degree, w=np.sqrt(weight))
             gain = [

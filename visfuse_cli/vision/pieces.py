@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from visfuse_cli.records import Array
-from visfuse_cli.vision.patches import Grey, log_height, side
+from visfuse_cli.vision.patches import Grey, side
 
 SAMPLES = 14  # along a side of a piece
 SMALLEST, MOST = 11.0, (6, 4)  # px: a piece's side at its first sight; pieces across and down
@@ -40,9 +40,8 @@ class Seen:
 @dataclass(slots=True)
 class _Piece:
     number: int
-    half: Array  # (2,) px at its first sight
-    values: Array  # (n,) grey values there
-    tall: float  # log height of the whole patch there
+    half: Array  # (2,) half sides, in those of the patch
+    values: Array  # (n,) grey values at its first sight
     unit: dict[str, Array]  # (2,) of the patch in each view, where it was seen last
     seen: bool = False
     missed: int = 0
@@ -64,13 +63,14 @@ class Pieces:
         pieces = self.followed
         if not pieces:
             return Seen(*(np.zeros((0, *shape)) for shape in ((), (2,), (2,), (2, 2), (2, 2)))), quads
-        tall = float(log_height(quads["left"]))
-        half = np.stack([piece.half * np.exp(tall - piece.tall) for piece in pieces])
+        share = np.stack([piece.half for piece in pieces])
+        half = {view: share[..., None] * _sides(quad) for view, quad in quads.items()}
         expected = {view: placed(quad, np.stack([p.unit[view] for p in pieces])) for view, quad in quads.items()}
         left, left_cov, here = aligned(
-            views["left"], expected["left"], half, np.stack([piece.values for piece in pieces])
+            views["left"], expected["left"], half["left"], np.stack([piece.values for piece in pieces])
         )
-        right, across_cov, there = aligned(views["right"], expected["right"], half, _sampled(views["left"], left, half))
+        now = _sampled(views["left"], left, half["left"])
+        right, across_cov, there = aligned(views["right"], expected["right"], half["right"], now)
         found = (here > ALIKE) & (there > ALIKE)
         known = found & np.array([piece.seen for piece in pieces])
         places = {"left": left, "right": right}
@@ -90,7 +90,7 @@ class Pieces:
         for piece in self.followed:
             for view, quad in after.items():
                 piece.unit[view] = _unit(quad, placed(before[view], piece.unit[view][None]))[0]
-            piece.tall += float(log_height(after["left"]) - log_height(before["left"]))
+            piece.half = piece.half * np.divide(side(before["left"]), side(after["left"]))
 
     def _begin(self, levels: list[Grey], quad: Array) -> None:
         """New pieces on the cells of a regular grid over the quad that hold none."""
@@ -101,11 +101,10 @@ class Pieces:
         if not free:
             return
         unit = (np.array(free) + 0.5) / count
-        half = np.array([wide, high]) / count / 2
-        values = _sampled(levels, placed(quad, unit), np.tile(half, (len(free), 1)))
-        tall = float(log_height(quad))
+        half = 1 / np.array(count) / 2
+        values = _sampled(levels, placed(quad, unit), np.tile(half[:, None] * _sides(quad), (len(free), 1, 1)))
         for k in np.flatnonzero(values.std(axis=1) > FLAT):
-            self.followed.append(_Piece(self.count, half, values[k], tall, {"left": unit[k], "right": unit[k]}))
+            self.followed.append(_Piece(self.count, half, values[k], {"left": unit[k], "right": unit[k]}))
             self.count += 1
 
 
@@ -139,11 +138,16 @@ def carried(quad: Array, expected: Array, found: Array) -> Array:
     return np.asarray(middle + shift + np.exp(np.clip(stretch, -0.1, 0.1)) * (quad - middle))
 
 
+def _lengths(half: Array) -> Array:
+    """Lengths (P, 2) px of half sides (P, 2, 2) px."""
+    return np.linalg.norm(half, axis=-1)
+
+
 def _sampled(levels: list[Grey], middle: Array, half: Array) -> Array:
-    """Grey values (..., P, n) of pieces about (..., P, 2) px of half sides (P, 2) px."""
-    spacing = float(np.median(np.sqrt(np.prod(half, axis=-1)))) * 2 / SAMPLES
+    """Grey values (..., P, n) of pieces about (..., P, 2) px of half sides (P, 2, 2) px: across, down."""
+    spacing = float(np.median(np.sqrt(np.prod(_lengths(half), axis=-1)))) * 2 / SAMPLES
     level = int(np.clip(np.floor(np.log2(max(spacing, 1.0)) + 0.3), 0, len(levels) - 1))
-    at = (middle[..., None, :] + half[:, None, :] * UNIT) / 2**level
+    at = (middle[..., None, :] + UNIT @ half) / 2**level
     maps = np.ascontiguousarray(at.reshape(-1, SAMPLES * SAMPLES, 2), np.float32)
     values = cv2.remap(levels[level], maps, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return values.reshape(at.shape[:-1]).astype(float)
@@ -152,11 +156,12 @@ def _sampled(levels: list[Grey], middle: Array, half: Array) -> Array:
 def aligned(levels: list[Grey], middle: Array, half: Array, values: Array) -> tuple[Array, Array, Array]:
     """Where pieces (P, n) lie near (P, 2) px: places (P, 2), covariances (P, 2, 2), correlations (P,), 0 where lost.
 
-    Gauss-Newton on grey values, all pieces at once, gain and offset free.
+    `half` (P, 2, 2) px: half sides there. Gauss-Newton on grey values, all pieces at once, gain and offset free.
     """
     count = len(middle)
-    h = np.maximum(half / SAMPLES, 0.5)
-    reach = np.maximum(REACH * half.min(axis=1), 1.0)
+    long = _lengths(half)
+    h = np.maximum(long / SAMPLES, 0.5)
+    reach = np.maximum(REACH * long.min(axis=1), 1.0)
     shift = np.zeros((count, 2))
     target = values - values.mean(axis=1, keepdims=True)
     steps = np.stack([np.zeros_like(h), h * [1, 0], -h * [1, 0], h * [0, 1], -h * [0, 1]])
@@ -182,6 +187,6 @@ def aligned(levels: list[Grey], middle: Array, half: Array, values: Array) -> tu
         if np.abs(step).max() < 0.003:
             break
     # Samples finer than the picture's pixels do not add to each other.
-    finer = np.maximum(1.0, np.prod(SAMPLES / (2 * half), axis=1))
+    finer = np.maximum(1.0, np.prod(SAMPLES / (2 * long), axis=1))
     lost = (np.linalg.norm(shift, axis=1) > reach) | (gain <= 0.05) | (np.sqrt(cov[:, 0, 0] + cov[:, 1, 1]) > SURE)
     return middle + shift, cov * finer[:, None, None], np.where(lost, 0.0, correlation)
