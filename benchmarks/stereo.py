@@ -7,7 +7,9 @@ tables I and II with the causal filter, as the paper has it.
 from __future__ import annotations
 
 import argparse
+import hashlib
 import json
+import subprocess
 import sys
 import tempfile
 import time
@@ -19,13 +21,16 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from samples.passing import MPH, straight_pass, write_pass
+from samples.passing import MPH, PassScene, straight_pass, write_pass
 from visfuse_cli.commands.track_stereo_pf import run
 from visfuse_cli.facing.settings import StereoConfig
 from visfuse_cli.records import RunRequest
 from visfuse_cli.vision import patches
 
 UNAIDED = {"init": False, "path": False}
+MEASURED = "import resource, sys; from visfuse_cli.cli import main; sys.argv[0] = 'visfuse'\ntry: main()\nfinally: "
+MEASURED += "print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, file=sys.stderr)"
+_scenes = tempfile.TemporaryDirectory()
 
 
 def main() -> None:
@@ -37,6 +42,7 @@ def main() -> None:
         "rivals": rivals,
         "particles": particles,
         "parts": parts,
+        "memory": lambda n: memory(),
         "speed": lambda n: speed(),
     }
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -61,10 +67,9 @@ def passes(title: str, seeds: int, settings: dict | None = None, **scene) -> Non
     files = {key: scene.pop(key) for key in ("init", "path") if key in scene}
     errors, speeds, spent, held, steady = [], [], [], 0, 0
     for seed in range(seeds):
+        made = straight_pass(seed, **scene)
         with tempfile.TemporaryDirectory() as folder:
-            made = straight_pass(seed, **scene)
-            write_pass(made, Path(folder) / "scene", **files)
-            track = longest(Path(folder), settings or {}, seed)
+            track = longest(rendered(made, **files), Path(folder) / "run", settings or {}, seed)
             document = json.loads((Path(folder) / "run" / "run.json").read_text(encoding="utf-8"))
             spent.append(1e3 * document["seconds_per_stage"]["filter"] / document["counts"]["pairs"])
         if track is None:
@@ -88,11 +93,19 @@ def passes(title: str, seeds: int, settings: dict | None = None, **scene) -> Non
     )
 
 
-def longest(folder: Path, settings: dict, seed: int) -> dict | None:
-    """The longest track of a run on folder/scene."""
+def rendered(made: PassScene, **files: bool) -> Path:
+    """The scene's folder, rendered when it is first asked for."""
+    name = hashlib.sha256(repr((made, sorted(files.items()))).encode()).hexdigest()[:16]
+    folder = Path(_scenes.name) / name
+    if not folder.exists():
+        write_pass(made, folder, **files)
+    return folder
+
+
+def longest(scene: Path, out: Path, settings: dict, seed: int) -> dict | None:
+    """The longest track of a run on a scene."""
     config = StereoConfig.model_validate(settings)
-    out = folder / "run"
-    request = RunRequest("track-stereo-pf", folder / "scene", out, config, video=False, report=False, seed=seed)
+    request = RunRequest("track-stereo-pf", scene, out, config, video=False, report=False, seed=seed)
     run(RunRequest(**{name: getattr(request, name) for name in request.__slots__} | {"progress": False}))
     tracks = json.loads((out / "tracks.json").read_text(encoding="utf-8"))["tracks"]
     return max(tracks, key=lambda track: len(track["states"]), default=None)
@@ -125,6 +138,19 @@ def parts(seeds: int) -> None:
         passes(f"{count} parts, 400 particles", seeds, settings, mph=55.0)
 
 
+def memory() -> None:
+    """Peak memory of whole runs with 400 to 40,000 particles: poses are observed in chunks."""
+    for count in (400, 4000, 40_000):
+        with tempfile.TemporaryDirectory() as out:
+            scene = rendered(straight_pass(0, mph=55.0))
+            options = ["--out", out, "--overwrite", "--no-video", "--no-report", "-q"]
+            command = [sys.executable, "-c", MEASURED, "track-stereo-pf", str(scene), *options]
+            done = subprocess.run(
+                [*command, "--set", f"filter.particles={count}"], capture_output=True, text=True, check=True
+            )
+        print(f"{count:>6} particles: {int(done.stderr.split()[-1]) / 1024:.0f} MB", flush=True)
+
+
 def speed() -> None:
     """CPU time of the observation of 400 particles in both 1280x960 views, ours and a loop that warps each."""
     cv2.setNumThreads(1)
@@ -135,10 +161,7 @@ def speed() -> None:
     reference = patches.part_values(levels[0], quads[:1])[0]
 
     def ours() -> None:
-        values = [patches.part_values(each, quads) for each in levels]
-        for each in values:
-            patches.part_distance(each, reference)
-        patches.correlations(*values)
+        patches.observed((levels[0], levels[1]), (quads, quads), reference, patches.PARTS)
 
     def loop() -> None:
         square = np.array([[0, 0], [40, 0], [40, 40], [0, 40]], np.float32)

@@ -36,11 +36,12 @@ AGAIN = 0.55  # of the effective number: below, the particles are drawn anew
 JITTER = 0.5  # of the optimal kernel's width
 FOUND_SHARE = 0.4  # how far the speed of what was found unaided may be off
 DEPTH_PX = 0.5  # deviation of the disparity of quads that were given
-USUAL_SIGMA, USUAL_DEPTH = 0.15, 20.0  # m/s a frame at 5 frames/s, of what is that far away (m) or farther
+USUAL_SIGMA, USUAL_DEPTH = 0.10, 20.0  # m/s a frame at 5 frames/s, of what is that far away (m) or farther
 STRAYED = 60.0  # squared deviations of the cloud from the patch that was found
 BLUR_PX, BLUR_STRETCH = 0.3, 0.01  # which is not thought of as strayed
 USUAL = 4.0  # measurements that the stated noise stands for
 LEAST_NOISE = 0.5
+FREEDOM = 4.0  # of Student's t: how often a measurement is off by more than its noise
 ROUNDS, STEP, NUGGET = (
     3,
     0.1,
@@ -144,7 +145,9 @@ def take_in(target: Target) -> None:
     # The stated noise, made larger where the measurements so far were farther off than it allows.
     noise = max(LEAST_NOISE, (5 * USUAL + sum(target.nis)) / (5 * USUAL + 5 * told)) * look.R
     if len(target.looks) > 1:
-        target.nis.append(float(residual @ np.linalg.solve(expect.cov + noise, residual)))
+        nis = float(residual @ np.linalg.solve(expect.cov + noise, residual))
+        target.nis.append(nis)
+        noise = noise * max(1.0, (FREEDOM + nis) / (FREEDOM + 5))
     whole, ahead = np.ones(len(target.states), dtype=bool), forward(target)
     both = [side for side in (ahead, ~ahead) if np.count_nonzero(side) > target.states.shape[1] + 1]
     sides = both if both and not target.oriented else [whole]

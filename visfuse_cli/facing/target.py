@@ -6,7 +6,7 @@ import numpy as np
 
 from visfuse_cli.facing import cloud, free
 from visfuse_cli.facing.front import FACING, FACING_FOUND, Shape, Target, corners, middle, quads_of, shape_of
-from visfuse_cli.facing.look import look, measured, take_over
+from visfuse_cli.facing.look import look, measured, moved_across, take_over
 from visfuse_cli.facing.settings import StereoConfig
 from visfuse_cli.maths import particles
 from visfuse_cli.maths.paths import Way
@@ -37,6 +37,7 @@ def start(
     `doubt` (m/s): how far `speed` may be off where the front was found unaided; None where it was given.
     """
     (left, right), given = quads, doubt is None
+    right = moved_across(views, left, right)
     place = triangulated(rig, left.mean(axis=0), right.mean(axis=0))
     if not np.isfinite(place).all() or place[2] <= 0.1:
         return None
@@ -111,8 +112,7 @@ def _likelihood(target: Target, views: dict[str, list[Grey]]) -> Array:
     """Log likelihood (P,) of the particles: parts in either view, correlation across. Zhu 2012, eqs. 13, 17-18."""
     quads = quads_of(target, target.states)
     settings = target.config.observation
-    values = {view: patches.part_values(views[view], quads[view], settings.parts) for view in ("left", "right")}
-    distance = sum((patches.part_distance(each, target.reference) for each in values.values()), np.zeros(1))
-    across = patches.correlations(values["left"], values["right"])
+    seen = (views["left"], views["right"]), (quads["left"], quads["right"])
+    distance, across = patches.observed(*seen, target.reference, settings.parts)
     bad = ~np.isfinite(quads["left"]).all(axis=(1, 2)) | ~np.isfinite(quads["right"]).all(axis=(1, 2))
     return np.where(bad, -1e6, -settings.lambda_d * distance + settings.lambda_c * across)

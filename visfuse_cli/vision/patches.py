@@ -269,25 +269,41 @@ def part_cells(parts: int) -> Array:
     return np.concatenate([upper, lower + [0.0, 0.5]])
 
 
-def part_values(levels: list[Grey], quads: Array, parts: int = PARTS) -> Grey:
+def part_level(levels: list[Grey], quads: Array, parts: int) -> int:
+    """The level of the pyramid that suits the cells of quads (P, 4, 2)."""
+    count = (parts / 2 * CELLS, 2 * CELLS)
+    some = [_spacing(quad, count) for quad in quads[:: len(quads) // 9 + 1]]
+    return _level(levels, float(np.median(some)))
+
+
+def part_values(levels: list[Grey], quads: Array, parts: int = PARTS, level: int | None = None) -> Grey:
     """Cell values (P, 16 parts) of the parts of quads (P, 4, 2), 4 x 4 cells each, normalised in mean and contrast.
 
     In orthonormal form the distance of a part's 16 Haar-like values is that of its 16 cells. Zhu 2012, eq. 13.
     """
-    count = (parts / 2 * CELLS, 2 * CELLS)
-    some = [_spacing(quad, count) for quad in quads[:: len(quads) // 9 + 1]]
-    level = _level(levels, float(np.median(some)))
+    level = part_level(levels, quads, parts) if level is None else level
     unit = part_cells(parts).astype(np.float32)
-    out = np.empty((len(quads), len(unit)), np.float32)
     usable = np.nan_to_num(quads / 2**level, nan=-1e6).astype(np.float32)
-    for k in range(0, len(quads), CHUNK):  # small buffers that stay in the cache, however many poses there are
-        at = warped(usable[k : k + CHUNK], unit)
-        across, down = np.ascontiguousarray(at[..., 0]), np.ascontiguousarray(at[..., 1])
-        values = cv2.remap(levels[level], across, down, cv2.INTER_LINEAR)
-        values -= values.mean(axis=-1, keepdims=True)
-        spread = np.sqrt(np.einsum("pc,pc->p", values, values) / len(unit))
-        np.divide(values, np.maximum(spread, 1e-3)[:, None], out=out[k : k + CHUNK])
-    return out
+    at = warped(usable, unit)
+    across, down = np.ascontiguousarray(at[..., 0]), np.ascontiguousarray(at[..., 1])
+    values = cv2.remap(levels[level], across, down, cv2.INTER_LINEAR)
+    values -= values.mean(axis=-1, keepdims=True)
+    spread = np.sqrt(np.einsum("pc,pc->p", values, values) / len(unit))
+    return np.asarray(values / np.maximum(spread, 1e-3)[:, None], np.float32)
+
+
+def observed(
+    views: tuple[list[Grey], list[Grey]], quads: tuple[Array, Array], reference: Grey, parts: int
+) -> tuple[Array, Array]:
+    """Distance (P,) of both views' parts in quads (P, 4, 2) from a reference, and correlation (P,) across the views."""
+    levels = [part_level(view, quad, parts) for view, quad in zip(views, quads, strict=True)]
+    distance, across = np.empty(len(quads[0])), np.empty(len(quads[0]))
+    for k in range(0, len(distance), CHUNK):  # small buffers that stay in the cache, however many poses there are
+        some = slice(k, k + CHUNK)
+        left, right = (part_values(views[i], quads[i][some], parts, levels[i]) for i in (0, 1))
+        distance[some] = part_distance(left, reference) + part_distance(right, reference)
+        across[some] = correlations(left, right)
+    return distance, across
 
 
 def part_distance(values: Grey, reference: Grey) -> Array:
