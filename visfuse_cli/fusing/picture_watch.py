@@ -9,7 +9,7 @@ from visfuse_cli.fusing.body import Body, usual_body
 from visfuse_cli.fusing.clocks import places_alone
 from visfuse_cli.fusing.person import Person
 from visfuse_cli.fusing.settings import FuseConfig
-from visfuse_cli.fusing.sighting import expect, learn_body, tracked_point
+from visfuse_cli.fusing.sighting import expect, learn_body, lowest, tracked_point
 from visfuse_cli.fusing.tracker import PRIOR_LOOKS, Newcomer, Tracker, beginning
 from visfuse_cli.fusing.visibility import standing
 from visfuse_cli.records import Array, Gaussian, Image, Sighting
@@ -150,7 +150,10 @@ class PictureWatch:
             measured = tracked_point(there, who, seen, body, self._config)
             if measured is not None:
                 z, R, lever = measured
-                found[camera] = Sighting(z, R, eye.straight.shown(seen.rim), dt, lever, float(lever @ assumed))
+                rim = seen.rim[seen.rim[:, 1] <= lowest(there, who)]
+                if not len(rim):
+                    continue
+                found[camera] = Sighting(z, R, eye.straight.shown(rim), dt, lever, float(lever @ assumed))
                 if camera not in self._distrusted:
                     learn_body(body, assumed, there, who, seen)
         return found

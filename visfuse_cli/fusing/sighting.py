@@ -20,6 +20,7 @@ LOOSE_M = 0.35  # how far from the prediction a person's pixels are looked for, 
 WHOLE = 0.4  # share of a person that must be seen for the body's lengths to be learnt
 POSTURE_M = 0.03  # how much the height comes and goes
 ENDS_M = 0.08  # noise of one look at where head or feet end
+UNDER_M = 0.12  # what reaches farther below the ground than this, the doubt of the place aside, is a reflection
 STRANGE_M = 0.5  # what ends farther from where it is expected is something else
 
 
@@ -69,7 +70,7 @@ def tracked_point(
     u = _sideways(seen, body.half.mean * scale, limb, BREADTH_M * scale / 2)
     height_sigma = float(np.hypot(np.sqrt(body.ends.cov[0, 0]), POSTURE_M))
     foot_only = config.fusion.point == "foot"
-    ends = _ends(seen, expected.box[who])
+    ends = _ends(seen, expected.box[who], lowest(expected, who))
     v = _upright(seen, expected.box[who], ends, end, height_sigma * scale, foot_only)
     if u is None and v is None:
         return None
@@ -93,9 +94,16 @@ def _sideways(seen: Sides, half: float, sigma: float, half_sigma: float) -> tupl
     return None
 
 
-def _ends(seen: Sides, box: Array) -> tuple[bool, bool]:
-    """Whether top and bottom tell anything."""
+def lowest(expected: Expected, who: int) -> float:
+    """The lowest row (px) that somebody's own feet reach."""
+    return float(expected.box[who, 3] + UNDER_M * expected.scale[who] + expected.reach[who])
+
+
+def _ends(seen: Sides, box: Array, lowest: float) -> tuple[bool, bool]:
+    """Whether top and bottom tell anything; what is below the `lowest` row is a reflection."""
     top, bottom = float(seen.box[1] - box[1]), float(seen.box[3] - box[3])
+    if seen.box[3] > lowest:
+        return seen.top, False
     if seen.top and seen.bottom and abs(bottom - top) > TALLER * (box[3] - box[1]):
         # with a wrong height one end is something else's
         return (False, True) if abs(top) > abs(bottom) else (True, False)
@@ -139,5 +147,5 @@ def learn_body(body: Body, assumed: Array, expected: Expected, who: int, seen: S
     height, head, feet = assumed
     if seen.top and abs(up[1]) < STRANGE_M:
         body.ends.learn(level + height + slope * head + up[1], np.array([1.0, slope, 0.0]), ENDS_M)
-    if seen.bottom and abs(up[3]) < STRANGE_M:
+    if seen.bottom and seen.box[3] <= lowest(expected, who) and up[3] < STRANGE_M:
         body.ends.learn(-(level - slope * feet + up[3]), np.array([0.0, 0.0, slope]), ENDS_M)

@@ -13,7 +13,6 @@ from visfuse_cli.vision.background import FOREGROUND
 from visfuse_cli.vision.backing import covered
 
 SIDEWAYS_M, UPWARDS_M = 0.3, 0.25  # how far around the expected box a person's pixels are looked for
-UNDER_M = 0.12  # and below it: what reaches farther down is mirrored by the ground
 LEAST_ROW, LEAST_COLUMN = 0.10, 0.05  # share of the width, of the height, that a side's row or column holds
 BEYOND_PX = 4  # px outside of a side that tell whether something else begins there
 PARTLY_PX = 0.4  # px that a silhouette reaches too far: pixels that are covered in part count as a whole
@@ -83,9 +82,9 @@ def sides(mask: Image, outside: Image, expected: Expected, who: int, backed: Arr
     """
     high, wide = mask.shape
     scale, box = expected.scale[who], expected.box[who]
-    around, above, below = np.array([SIDEWAYS_M, UPWARDS_M, UNDER_M]) * scale + expected.reach[who]
+    around, above = SIDEWAYS_M * scale + expected.reach[who], UPWARDS_M * scale + expected.reach[who]
     left, top = max(int(box[0] - around), 0), max(int(box[1] - above), 0)
-    right, bottom = min(int(box[2] + around) + 1, wide), min(int(box[3] + below) + 1, high)
+    right, bottom = min(int(box[2] + around) + 1, wide), min(int(box[3] + above) + 1, high)
     if right - left < 3 or bottom - top < 5:
         return None
     part, window = mask[top:bottom, left:right], (left, top, right, bottom)
