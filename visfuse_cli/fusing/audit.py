@@ -117,15 +117,15 @@ def complaints(names: list[str], findings: list[Finding], interval_s: float) -> 
     known = np.array([each.sightings >= LEAST for each in findings])
     said, wrong = [], misfits(findings)
     for c, each in enumerate(findings):
-        others = known & (np.arange(len(names)) != c)
-        if np.count_nonzero(others) < 2:
-            continue
+        others = known & (np.arange(len(names)) != c) & ~np.isin(np.arange(len(names)), wrong)
         if c in wrong:
             said.append(
                 f"camera '{names[c]}' does not fit the others: people stand {np.linalg.norm(each.shift):.0f} px "
                 f"({each.shift_m:.2f} m) from where its calibration puts them, and {each.unused:.0%} of its clear "
                 "sights were of no use; was it moved, or calibrated at another size?"
             )
+            continue
+        if np.count_nonzero(others) < 2:
             continue
         behind = each.late - float(np.median(late[others]))
         if known[c] and abs(behind) > max(LATE_S, 0.6 * interval_s) and abs(behind) > SURE * each.late_sigma:

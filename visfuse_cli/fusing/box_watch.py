@@ -51,6 +51,7 @@ class BoxWatch:
         person = self._config.person
         found: list[Newcomer] = []
         for group in self._left:
+            group = group[~np.isin(boxes.camera[group], tracker.distrusted)]
             if len(group) < 2:
                 continue
             agreed = agree(self._P[boxes.camera[group]], boxes.z[group], boxes.R[group])

@@ -66,8 +66,6 @@ def conclude(person: Person, P: Array, config: FuseConfig) -> Path | None:
         return None
     frame = np.array(person.history.frame)
     told = (seen.any(axis=1) | (np.array(person.history.denied) < DENIED)) & (frame >= 0)
-    if not told.any():
-        return None
     state = person.history.state
     sights, lever = _sights(rows, seen, state, P, person.body.ends.mean)
     noise, sigma_a = 1.0, config.filter.sigma_a
@@ -82,6 +80,8 @@ def conclude(person: Person, P: Array, config: FuseConfig) -> Path | None:
     centroid = config.fusion.point == "centroid"
     belief = stated(belief, sights, J, lever, person.body.ends.cov, noise, centroid)
     told &= (np.count_nonzero(seen, axis=1) != 1) | (_aside(belief) < config.life.max_doubt)
+    if not told.any():
+        return None
     residual = np.full((*seen.shape, 2), np.nan)
     residual[sights.owner, sights.camera] = sights.z - pixels
     return Path(

@@ -177,7 +177,7 @@ class PictureWatch:
             )
             there = self._backed(_stacked([belief]), [body])[0]
             sightings = self._sightings(expected, there, len(people), body)
-            cameras = sorted(sightings)
+            cameras = sorted(set(sightings) - set(self._distrusted))
             if len(cameras) < 2:
                 return None
             z, R = (np.stack([getattr(sightings[camera], name) for camera in cameras]) for name in ("z", "R"))

@@ -113,8 +113,8 @@ class Tracker:
         sights = at_one_time(_flat(sightings), self.P, prior)
         settled = np.array([person.confirmed for person in self.people])
         self.audit.take(sights.of(settled[sights.owner]), self.P, prior)
-        good = consistent(sights, self.P, prior.mean[:, :3], self.config.sight.gate)
-        good &= ~np.isin(sights.camera, self.distrusted)
+        good = ~np.isin(sights.camera, self.distrusted)
+        good[good] = consistent(sights.of(good), self.P, prior.mean[:, :3], self.config.sight.gate)
         good &= self._expected(sights.of(good), good, prior)
         used = sights.of(good)
         banks = [person.bank for person in self.people]
