@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from tests.test_fusion import ring
+from visfuse_cli.fusing.audit import Finding, complaints, misfits
 from visfuse_cli.fusing.body import usual_body
 from visfuse_cli.maths import motion, multiview
 from visfuse_cli.pipeline import Run
@@ -112,3 +113,19 @@ def test_sets_go_on_without_the_first_camera(first, numbers):
     assert [each.frames["b"].index for each in sets] == list(range(10))
     np.testing.assert_allclose([each.t for each in sets], 0.1 * np.arange(10), atol=1e-9)
     assert [each.index for each in alone] == list(range(len(first)))
+
+
+def test_a_camera_that_stands_elsewhere_is_no_witness_of_clocks():
+    def found(shift_m: float = 0.02, late: float = 0.0, unused: float = 0.1) -> Finding:
+        return Finding(200, np.array([50.0, 0.0]) * shift_m, shift_m, late, 0.005, unused)
+
+    names = ["a", "b", "c", "d"]
+    said = complaints(names, [found(), found(late=0.3), found(), found()], 0.05)
+    assert len(said) == 1
+    assert "'b' is about 0.30 s or more late" in said[0]
+    said = complaints(names, [found(), found(), found(0.6, 0.2, 0.9), found()], 0.05)
+    assert len(said) == 1
+    assert "'c' does not fit the others" in said[0]
+    # with one witness left nobody is called late
+    assert len(complaints(names[:3], [found(late=0.3), found(), found(0.6, 0.0, 0.9)], 0.05)) == 1
+    assert misfits([found(), found(0.6, 0.0, 0.9)]) == []  # of two, either may be the one
