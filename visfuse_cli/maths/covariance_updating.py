@@ -40,14 +40,20 @@ def steered(x: Array, dt: ArrayLike, wheelbase: ArrayLike, straighten: float = 0
 
 
 def noise(
-    x: Array, dt: ArrayLike, wheelbase: ArrayLike, sigma_steer: float, sigma_jerk: float, straighten: float = 0.0
+    x: Array,
+    dt: ArrayLike,
+    wheelbase: ArrayLike,
+    sigma_steer: ArrayLike,
+    sigma_jerk: ArrayLike,
+    straighten: float = 0.0,
 ) -> Array:
     """Q (..., 6, 6) over dt (...) s of Brownian steering (rad/s per root Hz) and acceleration (m/s^3 per root Hz)."""
     dt = np.broadcast_to(np.asarray(dt, dtype=float), x.shape[:-1])
     struck = dt * _fractions(dt)  # when the noise strikes, points first: (3, ...)
     there = steered(x, struck, wheelbase, straighten)[0]
     to_end = steered(there, dt - struck, wheelbase, straighten)[1][..., DRIVEN]
-    rates = (to_end * np.array([sigma_steer, sigma_jerk]) ** 2) @ transpose(to_end)
+    density = np.stack(np.broadcast_arrays(np.asarray(sigma_steer) ** 2.0, np.asarray(sigma_jerk) ** 2.0), axis=-1)
+    rates = (to_end * density[..., None, :]) @ transpose(to_end)
     return symmetrise(np.tensordot(WEIGHTS / 2, rates, axes=1) * dt[..., None, None])
 
 
@@ -56,8 +62,8 @@ def advance(
     cov: Array,
     dt: ArrayLike,
     wheelbase: ArrayLike,
-    sigma_steer: float,
-    sigma_jerk: float,
+    sigma_steer: ArrayLike,
+    sigma_jerk: ArrayLike,
     straighten: float = 0.0,
 ) -> tuple[Array, Array, Array]:
     """Mean (..., 6) dt (...) s later, the Jacobian F and the noise Q (..., 6, 6), so that P' = F P F^T + Q.

@@ -75,10 +75,12 @@ def for_target(target: TargetSettings, filter_: FilterSettings) -> Dynamics:
 
 
 def _bicycle(filter_: FilterSettings, accelerates: bool, fades: bool) -> Dynamics:
-    steer, straighten = filter_.sigma_steer, filter_.straighten
+    straighten = filter_.straighten
 
     def advance(x: Array, cov: Array, dt: Array, length: Array) -> tuple[Array, Array, Array]:
         wheelbase = WHEELBASE_SHARE * length
+        # Drivers steer as fast as they like at walking pace, and at speed as fast as the lateral jerk allows.
+        steer = (filter_.sigma_steer**-2 + (x[..., 2] ** 2 / (filter_.sigma_corner * wheelbase)) ** 2) ** -0.5
         if accelerates:
             return covariance_updating.advance(x, cov, dt, wheelbase, steer, filter_.sigma_jerk, straighten)
         return motion.bicycle_step(x, dt, wheelbase, filter_.sigma_a, steer, straighten)
