@@ -15,7 +15,8 @@ from visfuse_cli.tracking.settings import FilterSettings, TargetSettings
 
 WHEELBASE_SHARE = 0.6  # of a vehicle's length
 COURSES = (course.CSD, course.CS, course.CD)  # Bradshaw 1997, sec. 4.1
-QUIET = 0.2  # of the usual noise: what a motion still has where it holds something constant
+QUIET = 0.2  # of the usual noise: what a motion that holds its speed still has
+STRAIGHT = 0.02  # rad/s per root Hz: what one that holds its course still has
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,7 +144,7 @@ def _walk(filter_: FilterSettings, accelerates: bool, fades: bool) -> Dynamics:
 
 def _interacting(filter_: FilterSettings, heading_seen: bool) -> Dynamics:
     spare = (filter_.sigma_a**2, filter_.sigma_turn**2)
-    steady, straight = (QUIET * filter_.sigma_a) ** 2, (QUIET * filter_.sigma_steer) ** 2
+    steady, straight = (QUIET * filter_.sigma_a) ** 2, STRAIGHT**2
     densities = (  # of what each motion changes in speed and in course
         (steady, straight),
         (steady, filter_.sigma_turn**2),

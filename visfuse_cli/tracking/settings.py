@@ -78,10 +78,13 @@ class FilterSettings(Section):
     )
     sigma_a: float = Field(0.8, gt=0, le=50, description="m/s^2 per root Hz: how hard the target accelerates")
     sigma_steer: float = Field(
-        0.4, gt=0, le=5, description="rad/s per root Hz: how fast the steering angle changes at walking pace"
+        0.4, gt=0, le=5, description="rad/s per root Hz: how fast the steering angle changes at walking pace (not imm)"
     )
     sigma_corner: float = Field(
-        1.5, gt=0, le=1000, description="m/s^3 per root Hz: how fast the lateral acceleration changes, at speed"
+        1.5,
+        gt=0,
+        le=1000,
+        description="m/s^3 per root Hz: how fast the lateral acceleration changes, at speed (not imm)",
     )
     straighten: float = Field(
         2.0, ge=0, le=100, description="1/s: how fast drivers let the steering go back to straight; 0: never"
