@@ -7,9 +7,10 @@ from masks import CAR, SIZE, TRUCK, drive, evidence_of, labels_of, road_camera
 from visfuse_cli.maths.angles import wrap
 from visfuse_cli.tracking import hypotheses
 from visfuse_cli.tracking.conclude import conclude
+from visfuse_cli.tracking.dynamics import WHEELBASE_SHARE, for_target
 from visfuse_cli.tracking.evidence import BoxEvidence
 from visfuse_cli.tracking.ground import GroundTracker
-from visfuse_cli.tracking.settings import PERSON, LifeSettings, TargetSettings, TrackerSettings
+from visfuse_cli.tracking.settings import PERSON, FilterSettings, LifeSettings, TargetSettings, TrackerSettings
 from visfuse_cli.vision import regions, wireframe
 
 CAMERA = road_camera()
@@ -170,3 +171,14 @@ def test_silhouettes_of_the_live_tracks_are_their_outlines():
     true = wireframe.silhouette(CAMERA, truth[-1], CAR)
     np.testing.assert_allclose(outline.min(axis=0), true.min(axis=0), atol=8)
     np.testing.assert_allclose(outline.max(axis=0), true.max(axis=0), atol=8)
+
+
+@pytest.mark.parametrize("kind", ["fading", "cuf"])
+def test_steering_wanders_freely_at_walking_pace_and_by_the_lateral_jerk_at_speed(kind):
+    settings, length, dt = FilterSettings(kind=kind, straighten=0), 4.5, 0.04
+    dynamics = for_target(TargetSettings(), settings)
+    lateral = settings.sigma_corner * WHEELBASE_SHARE * length
+    for speed, expected in ((1.0, settings.sigma_steer), (40.0, lateral / 40.0**2)):
+        x = dynamics.begin(np.zeros(3), np.array([speed, 0.0])).mean[None]
+        Q = dynamics.advance(x, np.zeros((1, x.shape[1], x.shape[1])), np.array([dt]), np.array([length]))[2]
+        assert np.sqrt(Q[0, 4, 4] / dt) == pytest.approx(expected, rel=0.02)
