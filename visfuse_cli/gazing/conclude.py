@@ -45,8 +45,9 @@ def conclude(target: Target, ground: GroundMap) -> dict[str, Any] | None:
     t = np.array([look.t for look in looks])
     duration = float(t[-1] - t[0])
     distance = float(np.sum(np.hypot(*np.diff(mean[:, :2], axis=0).T)))
-    net = float(np.hypot(*(mean[-1, :2] - mean[0, :2])))
-    if not target.given and (net < life.min_moved or net < SLOWEST * duration):
+    off = np.hypot(*(mean[:, :2] - mean[0, :2]).T)
+    far = int(np.argmax(off))  # it may come back
+    if not target.given and (off[far] < life.min_moved or off[far] < SLOWEST * (t[far] - t[0])):
         return None
     names = target.models.names
     return {

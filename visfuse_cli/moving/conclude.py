@@ -140,12 +140,12 @@ def _of_template(rig: StereoRig, mean: Array, history: list[Any]) -> Array:
 
 def _moved(target: Target, settled: Settled) -> bool:
     """Whether a target found unaided went anywhere in the world, beyond what the camera's pose may be off by."""
-    place = settled.belief.mean[:, :3]
-    net = float(np.linalg.norm(place[-1] - place[0]))
-    doubt = float(np.sqrt(np.trace(settled.belief.cov[0, :3, :3]) + np.trace(settled.belief.cov[-1, :3, :3])))
-    duration = float(settled.t[-1] - settled.t[0])
+    place, cov = settled.belief.mean[:, :3], settled.belief.cov
+    off = np.linalg.norm(place - place[0], axis=1)
+    far = int(np.argmax(off))  # it may come back
+    doubt = float(np.sqrt(np.trace(cov[0, :3, :3]) + np.trace(cov[far, :3, :3])))
     least = target.config.life.min_moved + EGO_SHARE * target.away + 2 * doubt
-    return net > least and net / max(duration, 1e-6) > SLOWEST
+    return bool(off[far] > least and off[far] / max(float(settled.t[far] - settled.t[0]), 1e-6) > SLOWEST)
 
 
 def track_record(path: Settled, latency: float) -> dict[str, Any]:

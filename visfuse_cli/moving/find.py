@@ -20,7 +20,8 @@ AROUND = np.array([0.2, 0.3])  # of its sides: around what is followed already n
 THIN, FEWEST = 3, 50  # of the pixels, each way, that tell what is usual, and the fewest of these
 FARTHEST_M = 40.0
 NEAR = 0.25  # of the larger side of the smaller region: a gap across which both may be one thing
-WIDER, KEPT = 0.15, 0.6  # how far around a box its outline is looked for, and the least share of a side then left
+BELOW = 0.2  # of its height: how much ground below its feet may seem to move with it
+WIDER, KEPT = 0.15, 0.35  # how far around a box its outline is looked for, and the least share of a side then left
 BESIDE = 0.2  # of its width: what lies beside it and nearer may hide part of it
 RIM = 3.0  # px from the edge of the picture
 SLOWEST = 0.15  # m/s that a region must do in the world
@@ -208,7 +209,8 @@ class Finder:
             alike = before is not None and float(before.motion @ motion) > 0
             candidate = _Candidate(box, before.seen + 1 if before is not None and alike else 1, motion)
             if candidate.seen >= self._config.life.confirm_frames and not self._cut(box, depth, away):
-                u0, v0, u1, v1 = self._tight(box, depth, away, flow)
+                moved = np.tile(np.median(flow[own], axis=0), 2)  # the regions are those of the frame before
+                u0, v0, u1, v1 = self._tight(box, depth, away) + moved
                 ready.append(Found(np.array([[u0, v0], [u1, v0], [u1, v1], [u0, v1]]), velocity, away))
             else:
                 kept.append(candidate)
@@ -229,22 +231,24 @@ class Finder:
                 return True
         return False
 
-    def _tight(self, box: Array, depth: Array, away: float, flow: Array) -> Array:
-        """The box [u0, v0, u1, v1] no wider than what lies as far away, `away` m: flow alone runs over outlines.
-
-        depth (H, W) m is that of the frame before, from which flow (H, W, 2) px leads to the box's own.
-        """
-        moved = np.median(flow[int(box[1]) : int(box[3]) + 1, int(box[0]) : int(box[2]) + 1].reshape(-1, 2), axis=0)
+    def _tight(self, box: Array, depth: Array, away: float) -> Array:
+        """The box [u0, v0, u1, v1] no wider than what lies as far away, `away` m: flow alone runs over outlines."""
         more = WIDER * (box[2:] - box[:2])
-        low = np.maximum(np.floor(box[:2] - more - moved), 0).astype(int)
-        top = np.minimum(np.ceil(box[2:] + more - moved), [depth.shape[1] - 1, depth.shape[0] - 1]).astype(int)
-        disparity = self._rig.left.K[0, 0] * self._rig.baseline / depth[low[1] : top[1] + 1, low[0] : top[0] + 1]
+        low = np.maximum(np.floor(box[:2] - more), 0).astype(int)
+        high = np.minimum(np.ceil(box[2:] + more), [depth.shape[1] - 1, depth.shape[0] - 1]).astype(int)
+        disparity = self._rig.left.K[0, 0] * self._rig.baseline / depth[low[1] : high[1] + 1, low[0] : high[0] + 1]
         own = self._rig.left.K[0, 0] * self._rig.baseline / away
         near = np.abs(disparity - own) < max(1.0, 0.1 * own)
-        inner = box - np.tile(low + moved, 2)  # in the cut-out
+        inner = box - np.tile(low, 2)  # in the cut-out
         columns = _run(near[max(int(inner[1]), 0) : int(inner[3]) + 1].mean(axis=0), (inner[0] + inner[2]) / 2)
-        left, right = np.array(columns) - 0.5 + low[0] + moved[0]
-        return np.array([left, box[1], right, box[3]]) if right - left > KEPT * (box[2] - box[0]) else box
+        left, right = np.array(columns) - 0.5 + low[0]
+        if right - left <= KEPT * (box[2] - box[0]):
+            return box
+        # Below the feet the ground comes nearer at once.
+        level = np.abs(disparity - own)[:, slice(*columns)] < max(0.5, 0.05 * own)
+        bottom = _run(level.mean(axis=1), (inner[1] + inner[3]) / 2)[1] - 0.5 + low[1]
+        below = box[3] - bottom
+        return np.array([left, box[1], right, bottom if 0 < below < BELOW * (box[3] - box[1]) else box[3]])
 
 
 def _run(share: Array, middle: float) -> tuple[int, int]:

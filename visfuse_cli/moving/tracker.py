@@ -105,7 +105,10 @@ class Tracker(Pursuit[Target, Pair, Expected, Found]):
     def _match(self, pair: Pair, quad: Array) -> Array | None:
         """The right quad (4, 2) of a left one, over all depths."""
         views = {"left": pair.levels, "right": patches.pyramid(pair.pictures["right"])}
-        return match(self._rig, views, quad, self._config.measure.good)
+        beyond = quad[:, 0].min() < patches.side(quad)[0]  # its left part may be out of the right view
+        part = quad + np.array([[0.5, 0], [0, 0], [0, 0], [0.5, 0]]) * patches.side(quad)[0] if beyond else quad
+        found = match(self._rig, views, part, self._config.measure.good)
+        return None if found is None else found + quad - part
 
     def _started(
         self, identity: int, pair: Pair, left: Array, right: Array, velocity: Gaussian, given: bool
