@@ -21,7 +21,10 @@ USUAL_SIGMA, USUAL_RELIEF, USUAL_SPEED = 0.06, 0.1, 15.0
 FEWEST = 2  # pieces an instant: with fewer the whole patch stands for one
 STEP = 0.01  # m, of the numerical derivatives
 DRIFT_SPEED = 0.05  # m/s across the path
-PATH_SPEED_SHARE = 0.001  # of the speed: what the path's own direction may add
+PATH_SPEED_SHARE, TURN_SHARE = (
+    0.001,
+    0.003,
+)  # of the speed: what the path's own direction may add, and each rad of a bend
 PIXELS = ("left", "right", "left_cov", "across_cov")
 PLACE = [ALONG, RIGHT, UP]
 
@@ -167,7 +170,9 @@ def _settled(target: Target, t: Array, adjusted: Adjusted) -> Settled:
         measured=np.ones(T, dtype=bool),
         quads=_carried(target, states[:, PLACE]) if target.given else [look.quads for look in target.looks],
         mean_speed=mean_speed,
-        mean_sigma=float(np.hypot(np.sqrt(max(variance, 0.0)) / duration, PATH_SPEED_SHARE * mean_speed)),
+        mean_sigma=float(
+            np.hypot(np.sqrt(max(variance, 0.0)) / duration, _path_share(target.way, states) * mean_speed)
+        ),
         distance=way,
         noise=adjusted.noise,
         sigma_v=adjusted.sigma_v,
@@ -176,6 +181,12 @@ def _settled(target: Target, t: Array, adjusted: Adjusted) -> Settled:
         ended_by=target.ended_by,
         nis=target.nis,
     )
+
+
+def _path_share(way: Way, states: Array) -> float:
+    """What share of the speed the path may be wrong by, between the first and last of states (T, 4)."""
+    ends = way.frame(states[[0, -1], ALONG])[1][..., 0]
+    return float(np.hypot(PATH_SPEED_SHARE, TURN_SHARE * np.arccos(np.clip(ends[0] @ ends[1], -1.0, 1.0))))
 
 
 def _carried(target: Target, place: Array) -> list[dict[str, Array]]:
