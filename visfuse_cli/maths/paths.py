@@ -180,7 +180,7 @@ def through(points: Array, sigma: Array, roughness: float) -> Way:
     if along[-1] < along[0]:
         along, axes = -along, -axes
     degree = 1
-    for trial in (2, 3, 4):
+    for trial in (2, 3):
         if len(points) >= trial + SPARE:
             fit = np.polynomial.polynomial.polyfit(along, points, trial, w=np.sqrt(weight))
             line = np.polynomial.polynomial.polyfit(along, points, degree, w=np.sqrt(weight))
@@ -188,7 +188,8 @@ def through(points: Array, sigma: Array, roughness: float) -> Way:
                 float(np.sum(weight[:, None] * (points - np.polynomial.polynomial.polyval(along, c).T) ** 2))
                 for c in (line, fit)
             ]
-            if gain[0] - gain[1] > roughness * (trial - degree):
+            noise = max(1.0, gain[1] / (3 * (len(points) - trial - 1)))  # what the points themselves show of it
+            if gain[0] - gain[1] > roughness * noise * (trial - degree):
                 degree = trial
     fit = np.polynomial.polynomial.polyfit(along, points, degree, w=np.sqrt(weight))
     reach = np.linspace(
