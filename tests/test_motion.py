@@ -144,3 +144,25 @@ def test_constant_velocity_orders_positions_before_velocities():
     F = motion.constant_velocity(np.array([0.5, 2.0]), 2)
     np.testing.assert_allclose(F[1] @ [1, 2, 10, 20], [21, 42, 10, 20])
     assert F.shape == (2, 4, 4)
+
+
+def test_two_places_start_a_track_as_the_paper_has_it():
+    R, T = np.array([[0.04, 0.01], [0.01, 0.09]]), 0.2
+    places = np.array([[1.0, 2.0], [1.3, 1.8]])
+    place, velocity = motion.line_start(np.array([-T, 0.0]), places, R)
+    np.testing.assert_allclose(place.mean, places[1], atol=1e-12)
+    np.testing.assert_allclose(velocity.mean, (places[1] - places[0]) / T, atol=1e-12)
+    np.testing.assert_allclose(place.cov, R, atol=1e-12)
+    np.testing.assert_allclose(velocity.cov, 2 * R / T**2, atol=1e-12)
+
+
+def test_a_start_from_many_places_is_as_wrong_as_it_says():
+    rng, R = np.random.default_rng(0), np.diag([0.04, 0.09])
+    t = np.array([0.0, 0.1, 0.25, 0.3])
+    chi = np.zeros(2)
+    for _ in range(500):
+        places = np.array([5.0, -1.0]) + t[:, None] * np.array([2.0, 1.0]) + rng.normal(size=(4, 2)) @ np.sqrt(R)
+        for k, (belief, truth) in enumerate(zip(motion.line_start(t, places, R), ([5, -1], [2, 1]), strict=True)):
+            off = belief.mean - truth
+            chi[k] += off @ np.linalg.solve(belief.cov, off) / 500
+    np.testing.assert_allclose(chi, 2.0, rtol=0.15)

@@ -12,6 +12,7 @@ from visfuse_cli.gazing.models import Courses, combined
 from visfuse_cli.maths import course, imm
 from visfuse_cli.maths.assignment import gate_size
 from visfuse_cli.maths.imm import Bank, Step
+from visfuse_cli.maths.motion import line_start
 from visfuse_cli.moving.settings import ImmConfig
 from visfuse_cli.records import Array, Gaussian
 from visfuse_cli.vision import patches
@@ -212,12 +213,8 @@ def _begin(target: Target) -> None:
     seen = [look for look in target.looks if look.z is not None]
     t = np.array([look.t for look in seen]) - target.looks[0].t
     places = np.array([look.z[:2] for look in seen if look.z is not None])
-    A = np.column_stack([np.ones_like(t), t])
-    line = np.linalg.lstsq(A, places, rcond=None)[0]
-    share = np.linalg.inv(A.T @ A)
     noise = START_DOUBT * np.mean([look.R[:2, :2] for look in seen], axis=0)
-    velocity = Gaussian(line[1], share[1, 1] * noise)
-    bank = target.models.start(Gaussian(line[0], share[0, 0] * noise), velocity)
+    bank = target.models.start(*line_start(t, places, noise))
     ways = np.broadcast_to(np.eye(6), bank.beliefs.cov.shape)
     step = Step(bank.beliefs, ways, 0 * ways, bank.beliefs, bank.log_mu, bank)
     for k, look in enumerate(target.looks):

@@ -10,7 +10,7 @@ from scipy.linalg import expm
 
 from visfuse_cli.maths.angles import wrap
 from visfuse_cli.maths.gaussian import symmetrise, transpose
-from visfuse_cli.records import Array
+from visfuse_cli.records import Array, Gaussian
 
 STEERING_LIMIT = 0.7  # rad; no road car's wheels turn further, and tan(phi) stays below 0.85
 BICYCLE_MEASUREMENT = np.array([[1.0, 0, 0, 0, 0], [0, 1, 0, 0, 0], [0, 0, 0, 1, 0]])  # Lou 2002, eq. 2
@@ -231,3 +231,15 @@ def sinc(x: Array) -> tuple[Array, Array]:
     value = np.where(small, 1 - x**2 / 6 + x**4 / 120, np.sin(safe) / safe)
     slope = np.where(small, -x / 3 + x**3 / 30 - x**5 / 840, (safe * np.cos(safe) - np.sin(safe)) / safe**2)
     return value, slope
+
+
+def line_start(t: Array, places: Array, R: Array) -> tuple[Gaussian, Gaussian]:
+    """Place (d,) at t = 0 and velocity (d,) of the line through places (n, d) at t (n,) s, n >= 2. Jia 2008, eq. 41.
+
+    R (d, d) is the noise of one place, mapped through the measurement. Two places, the second at t = 0, give R and
+    2 R / T^2. Raises LinAlgError where all t are the same.
+    """
+    A = np.column_stack([np.ones_like(t), t])
+    share = np.linalg.inv(A.T @ A)
+    place, velocity = share @ A.T @ places
+    return Gaussian(place, share[0, 0] * R), Gaussian(velocity, share[1, 1] * R)
