@@ -23,6 +23,7 @@ STEP = 0.5  # px between the shifts that are tried
 ROUNDS = 2  # by which the best of them is refined to parts of a pixel
 NEAR = 2.5  # times the cells' scatter around their median: what is further off is something else
 BACK_PX = 1.0  # by which looking back from the right view may miss
+OUTLINE = 0.25  # px: noise of a shift by the outline alone, behind which other background shows in each view
 FLOOR = 0.03  # px, and the deviation is no less
 # What parts of a pixel are told by: brightness, and blue and red beside it. Compressed footage has these at half size.
 BRIGHT, HUE = np.array([0.114, 0.587, 0.299], np.float32), 0.05
@@ -44,9 +45,10 @@ def region_shift(
     """
     count = [int(np.clip(INNER * each / SMALLEST, 1, CELLS)) for each in patches.side(left)]
     found = _shift(pictures, left, right, along, reach, _cells(left, INNER, count), CLEAR)
-    if found is None:  # a plain thing has but its outline
-        found = _shift(pictures, left, right, along, reach, _cells(left, OUTER, [1, CELLS]), VAGUE)
-    return found
+    if found is not None:
+        return found
+    found = _shift(pictures, left, right, along, reach, _cells(left, OUTER, [1, CELLS]), VAGUE)
+    return None if found is None else (found[0], found[1] + (OUTLINE * along) ** 2)  # a plain thing has but its outline
 
 
 def _shift(
