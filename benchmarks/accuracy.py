@@ -21,7 +21,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from samples.files import write_scene
 from samples.road import KINDS
-from samples.score import matches, rows
+from samples.score import heading_errors, matches, rows
 
 LEAST_FRAMES = 25  # in the picture, to count as a vehicle
 
@@ -35,6 +35,7 @@ class Score:
     false: int = 0
     errors: list[float] = field(default_factory=list)
     inside: list[bool] = field(default_factory=list)
+    headings: list[float] = field(default_factory=list)  # degrees off, a figure for each measured frame
 
     def add(self, other: Score) -> None:
         self.found += other.found
@@ -42,15 +43,17 @@ class Score:
         self.false += other.false
         self.errors += other.errors
         self.inside += other.inside
+        self.headings += other.headings
 
     def __str__(self) -> str:
         mean, worst = (np.mean(self.errors), np.max(self.errors)) if self.errors else (np.nan, np.nan)
         share = f"{np.mean(self.inside):>6.0%}" if self.inside else f"{'-':>6}"
-        return f"{self.found:>6} {self.false:>5} {mean:>6.2f} {worst:>6.2f} {share}"
+        heading = f"{np.sqrt(np.mean(np.square(self.headings))):>7.1f}" if self.headings else f"{'-':>7}"
+        return f"{self.found:>6} {self.rows:>5} {self.false:>5} {mean:>6.2f} {worst:>6.2f} {share} {heading}"
 
 
-def score(run: Path, truth: Path, reach_m: float = 2.0) -> Score:
-    """Count the rows of a run that belong to a vehicle, and measure them."""
+def score(run: Path, truth: Path, reach_m: float = 2.0, headings: bool = True) -> Score:
+    """Count the rows of a run that belong to a vehicle, and measure them; the rival tells no headings."""
     matched = matches(run, truth, reach_m)
     good = [(row, true) for row, true, share, _ in matched if share >= 0.5]
     return Score(
@@ -63,11 +66,30 @@ def score(run: Path, truth: Path, reach_m: float = 2.0) -> Score:
             for row, true in good
             if row.get("ci95_low_kmh")
         ],
+        headings=heading_errors(run, truth) if headings else [],
     )
 
 
 def python(*arguments: object) -> None:
     subprocess.run([sys.executable, *map(str, arguments)], check=True)
+
+
+def scene(kind: str, seed: int, seconds: float, folder: Path) -> Path:
+    """A folder with a rendered scene and its calibration, made where it is not there yet."""
+    if not (folder / "H.json").exists():
+        write_scene(KINDS[kind](seed, seconds), folder)
+        points, H = folder / "points.csv", folder / "H.json"
+        python("-m", "visfuse_cli", "calibrate-homography", "--points", points, "--out", H, "-q")
+    return folder
+
+
+def measured(folder: Path, out: Path) -> tuple[Score, Score]:
+    """What visfuse and the rival make of one scene."""
+    clip, H, truth = folder / "clip.mp4", folder / "H.json", folder / "truth.csv"
+    switches = ("--no-video", "--no-report", "-q")
+    python("-m", "visfuse_cli", "speed", clip, "--homography", H, "--out", out / "run", *switches)
+    python(Path(__file__).parent / "rival.py", clip, H, out / "rival")
+    return score(out / "run", truth), score(out / "rival", truth, 4.0, headings=False)
 
 
 def main() -> None:
@@ -76,21 +98,18 @@ def main() -> None:
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--seconds", type=float, default=15)
     parser.add_argument("--kind", choices=sorted(KINDS), default="free-flow")
+    parser.add_argument("--scenes", type=Path, help="folder in which rendered scenes are kept and used again")
     options = parser.parse_args()
-    columns = f"{'found':>6} {'false':>5} {'mean':>6} {'worst':>6} {'in 95%':>6}"
-    print(f"{'':>5} {'':>8} | {'visfuse (km/h)':^33} | {'rival (km/h)':^33}")
+    columns = f"{'found':>6} {'rows':>5} {'false':>5} {'mean':>6} {'worst':>6} {'in 95%':>6} {'heading':>7}"
+    print(f"{'':>5} {'':>8} | {'visfuse (km/h, degrees)':^47} | {'rival (km/h)':^47}")
     print(f"{'seed':>5} {'vehicles':>8} | {columns} | {columns}")
     all_ours, all_rivals, vehicles = Score(), Score(), 0
     for seed in range(options.first, options.first + options.seeds):
         with tempfile.TemporaryDirectory() as name:
-            folder = Path(name)
-            clip, H, truth = folder / "clip.mp4", folder / "H.json", folder / "truth.csv"
-            write_scene(KINDS[options.kind](seed, options.seconds), folder)
-            python("-m", "visfuse_cli", "calibrate-homography", "--points", folder / "points.csv", "--out", H, "-q")
-            python("-m", "visfuse_cli", "speed", clip, "--homography", H, "--out", folder / "run", "--no-video", "-q")
-            python(Path(__file__).parent / "rival.py", clip, H, folder / "rival")
-            ours, rivals = score(folder / "run", truth), score(folder / "rival", truth, 4.0)
-            frames = [row["id"] for row in rows(truth)]
+            kept = options.scenes or Path(name)
+            folder = scene(options.kind, seed, options.seconds, kept / f"{options.kind}-{seed}")
+            ours, rivals = measured(folder, Path(name))
+            frames = [row["id"] for row in rows(folder / "truth.csv")]
         present = sum(frames.count(vehicle) >= LEAST_FRAMES for vehicle in set(frames))
         print(f"{seed:>5} {present:>8} | {ours} | {rivals}", flush=True)
         all_ours.add(ours)

@@ -39,6 +39,22 @@ def matches(run: Path, truth: Path, reach_m: float = 2.0) -> list[tuple[dict[str
     return found
 
 
+def heading_errors(run: Path, truth: Path, after_s: float = 1.0) -> list[float]:
+    """Degrees (mod a half turn) by which the tracks with a row err where measured, from `after_s` s of a track on."""
+    tracks = {track["id"]: track for track in json.loads((run / "tracks.json").read_text())["tracks"]}
+    facing = {(int(r["id"]), int(r["frame"])): float(r["heading"]) for r in rows(truth.with_name("drives.csv"))}
+    errors = []
+    for row, _, share, vehicle in matches(run, truth):
+        if vehicle is None or share < 0.5:
+            continue
+        states = tracks[int(row["track_id"])]["states"]
+        for state in states:
+            if state["measured"] and state["t"] - states[0]["t"] >= after_s:
+                off = state["heading"] - facing[vehicle, state["frame"]]
+                errors.append(abs(float(np.degrees((off + np.pi / 2) % np.pi - np.pi / 2))))
+    return errors
+
+
 def _states(path: Path) -> dict[int, Array]:
     """Vehicle -> (n, 5) t, x, y, vx, vy."""
     states: dict[int, list[list[float]]] = {}

@@ -1,5 +1,7 @@
 """The tracker on exact label pictures: births, look-back, hiding, joining, detections, ends."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from masks import CAR, SIZE, TRUCK, drive, evidence_of, labels_of, road_camera
@@ -11,6 +13,7 @@ from visfuse_cli.tracking.dynamics import WHEELBASE_SHARE, for_target
 from visfuse_cli.tracking.evidence import BoxEvidence
 from visfuse_cli.tracking.ground import GroundTracker
 from visfuse_cli.tracking.settings import PERSON, FilterSettings, LifeSettings, TargetSettings, TrackerSettings
+from visfuse_cli.tracking.verdict import SpeedSettings, evidence
 from visfuse_cli.vision import regions, wireframe
 
 CAMERA = road_camera()
@@ -111,6 +114,30 @@ def test_a_car_that_stops_stays_where_it_is():
     assert track.samples[-1].frame == len(truth) - 1
     assert error(track, tracker, truth)[0][-50:].max() < 0.5
     assert abs(track.steps[-1].posterior.mean[2]) < 0.3
+
+
+def test_a_car_that_stands_hidden_for_seconds_is_the_same_when_it_drives_on():
+    t = np.arange(225) / FPS
+    way = np.where(t < 2, 10 * t - 2.5 * t**2, 10.0) + np.clip(t - 6.6, 0, None) ** 2  # brakes, waits, goes at 2 m/s^2
+    truth = drive([1.0, 14.0], [0.0, 1.0], way)
+    hidden = (t > 2.6) & (t < 6.6)
+    tracker, tracks, _ = follow([[] if gone else [(pose, CAR)] for pose, gone in zip(truth, hidden, strict=True)])
+    (track,) = tracks
+    assert track.samples[0].t < 0.5
+    assert track.samples[-1].frame == len(truth) - 1
+    assert error(track, tracker, truth)[0][-20:].max() < 0.5
+
+
+def test_half_an_outline_is_believed_when_it_was_seen_for_long():
+    def seen(likeness, support, seconds):
+        t = np.arange(0, seconds, 1 / FPS)
+        return evidence(SimpleNamespace(likeness=likeness, support=support, t=t, measured=np.ones(len(t), bool)))
+
+    least = SpeedSettings().min_evidence
+    assert seen(0.98, 0.9, 1.0) > least
+    assert seen(0.85, 0.6, 1.5) < least
+    assert seen(0.9, 0.6, 12.0) > least
+    assert seen(0.7, 0.5, 12.0) < least
 
 
 def test_what_never_moves_is_given_up_with_its_place():

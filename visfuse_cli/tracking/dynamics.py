@@ -216,6 +216,11 @@ def _predict_models(dynamics: Dynamics, steps: Sequence[Step], dt: Array, length
     ]
 
 
+def pose(dynamics: Dynamics, x: Array) -> Array:
+    """Place (m) and heading (rad), (3,), of a state (n,)."""
+    return np.array([x[0], x[1], dynamics.heading(x)])
+
+
 def coast(prediction: Prediction) -> Step:
     """The step of a target that was not measured."""
     return Step(prediction.prior, prediction.prior, prediction.F, None, prediction.memory, prediction.models)

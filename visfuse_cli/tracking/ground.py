@@ -10,15 +10,16 @@ from functools import partial
 import numpy as np
 
 from visfuse_cli.maths.assignment import gate_size
-from visfuse_cli.maths.cameras import ground_scale, project
+from visfuse_cli.maths.cameras import project
 from visfuse_cli.maths.gaussian import mahalanobis
 from visfuse_cli.records import Array, GroundCamera
 from visfuse_cli.records import Region as ImageRegion
 from visfuse_cli.tracking import dynamics as dynamics_tools
-from visfuse_cli.tracking import measure
+from visfuse_cli.tracking import endings, measure
 from visfuse_cli.tracking.association import footprint_overlap
 from visfuse_cli.tracking.births import Nursery
 from visfuse_cli.tracking.dynamics import Dynamics, Prediction, Step
+from visfuse_cli.tracking.endings import ONE_PLACE, trimmed
 from visfuse_cli.tracking.evidence import Boxes, Evidence
 from visfuse_cli.tracking.hypotheses import Guess, gain_of
 from visfuse_cli.tracking.joining import WAIT_S
@@ -31,7 +32,7 @@ from visfuse_cli.vision import wireframe
 VAGUE_M = 1.5  # m: a pose less certain than this is no measurement
 YOUNG, LEAP = 12, 4.0  # frames after which one measurement may not change the velocity by more (m/s)
 SEEN_SHARE = 0.4  # of the unhidden area of a box that must have moved and of its border that must be found
-LIKENESS_S, UNLIKE = 0.4, 0.5  # s over which the share of the border that is found is averaged, and too little of it
+LIKENESS_S = 0.4  # s over which the share of the border that is found is averaged
 DOUBTFUL, MOVED_M = 0.25, 2.0  # share of the border that is not clear, to compare, and again so many m further
 WAIT_AT_MOST_S = 4.0  # before a doubtful track is compared again
 KEPT = 0.9  # of its frames and of the outline seen in them a track keeps when its box is exchanged
@@ -39,7 +40,6 @@ BETTER, MUCH_BETTER = 1.2, 2.0  # times as much must another box explain, and to
 LOOK_BACK_FRAMES = 120  # at most
 REACH_PX, REACH_SHARE = (4.0, 24.0), 0.2  # how far from its prediction an outline is looked for; of its height
 BESIDE_M = 6.0  # m between two tracks that may be parts of one vehicle
-ONE_PLACE = 0.4  # of a footprint in another's: one of the two is wrong
 
 
 class GroundTracker:
@@ -90,7 +90,7 @@ class GroundTracker:
 
     def finish(self) -> tuple[list[Track], list[Abandoned]]:
         """End everything that is still alive."""
-        tracks = [self._trimmed(track, "end of footage") for track in self.tracks]
+        tracks = [trimmed(track, "end of footage") for track in self.tracks]
         tracks, self.tracks, self._held = self._held + tracks, [], []
         return tracks, self._nursery.finish()
 
@@ -104,12 +104,12 @@ class GroundTracker:
 
     def expected(self) -> Boxes:
         """Pose (N, 3) and size (N, 3) of the tracks where they are predicted."""
-        pose = [self._pose_of(prediction.prior.mean) for prediction in self._expected]
+        pose = [dynamics_tools.pose(self.dynamics, prediction.prior.mean) for prediction in self._expected]
         return np.array(pose).reshape(-1, 3), np.array([track.size for track in self.tracks]).reshape(-1, 3)
 
     def boxes(self) -> Boxes:
         """Pose (N, 3) and size (N, 3) of the tracks, as last known."""
-        pose = [self._pose_of(track.steps[-1].posterior.mean) for track in self.tracks]
+        pose = [dynamics_tools.pose(self.dynamics, track.steps[-1].posterior.mean) for track in self.tracks]
         return np.array(pose).reshape(-1, 3), np.array([track.size for track in self.tracks]).reshape(-1, 3)
 
     def _boxes_at(self, frame: int, without: Sequence[Track] = ()) -> Boxes:
@@ -120,7 +120,7 @@ class GroundTracker:
                 continue
             k = bisect_left(track.samples, frame, key=lambda sample: sample.frame)
             if k < len(track.samples) and track.samples[k].frame == frame:
-                pose.append(self._pose_of(track.steps[k].posterior.mean))
+                pose.append(dynamics_tools.pose(self.dynamics, track.steps[k].posterior.mean))
                 size.append(track.size)
         return np.array(pose).reshape(-1, 3), np.array(size).reshape(-1, 3)
 
@@ -133,11 +133,8 @@ class GroundTracker:
         while len(recent) > LOOK_BACK_FRAMES or (len(recent) > least and self._t - recent[0][1] > life.look_back_s):
             recent.popleft()
 
-    def _pose_of(self, x: Array) -> Array:
-        return np.array([x[0], x[1], self.dynamics.heading(x)])
-
     def _measure(self, frame: int, evidence: Evidence) -> None:
-        pose = np.array([self._pose_of(expected.prior.mean) for expected in self._expected])
+        pose = np.array([dynamics_tools.pose(self.dynamics, expected.prior.mean) for expected in self._expected])
         size = np.array([track.size for track in self.tracks])
         sigma = np.array([track.size_sigma for track in self.tracks])
         look = evidence.look(pose, size, self._reach(pose))
@@ -172,7 +169,7 @@ class GroundTracker:
         if not due:
             return
         track = max(due, key=lambda each: each.doubt)
-        box = np.append(self._pose_of(track.steps[-1].posterior.mean), track.size)
+        box = np.append(dynamics_tools.pose(self.dynamics, track.steps[-1].posterior.mean), track.size)
         track.compared = Comparison(
             self._t + track.compared.wait, box[:2], min(2 * track.compared.wait, WAIT_AT_MOST_S)
         )
@@ -184,7 +181,13 @@ class GroundTracker:
         replaced = [track, *parts]
         taken = self._boxes_at(frame, without=replaced)
         explained = [
-            gain_of(self.camera, evidence, self._pose_of(each.steps[-1].posterior.mean), each.size, taken)
+            gain_of(
+                self.camera,
+                evidence,
+                dynamics_tools.pose(self.dynamics, each.steps[-1].posterior.mean),
+                each.size,
+                taken,
+            )
             for each in replaced
         ]
         times = guess.gain / max(float(np.nansum(explained)), 1e-9)
@@ -198,7 +201,7 @@ class GroundTracker:
             better.compared = track.compared
             self.tracks[self.tracks.index(track)] = better
             self.tracks = [each for each in self.tracks if not any(each is part for part in parts)]
-            self._held += [self._trimmed(part, f"part of track {track.id}") for part in parts]
+            self._held += [trimmed(part, f"part of track {track.id}") for part in parts]
 
     def _doubtful_beside(self, track: Track) -> list[Track]:
         """The other tracks near enough to be a part of the same vehicle, none of them sure."""
@@ -212,7 +215,7 @@ class GroundTracker:
         ]
 
     def _shares_place(self, track: Track, guess: Guess) -> bool:
-        pose = self._pose_of(track.steps[-1].posterior.mean)
+        pose = dynamics_tools.pose(self.dynamics, track.steps[-1].posterior.mean)
         return bool(footprint_overlap(pose[None], track.size[None], guess.pose[None], guess.size[None]) > ONE_PLACE)
 
     def _comparable(self, track: Track) -> bool:
@@ -222,8 +225,8 @@ class GroundTracker:
     def _released(self) -> list[Track]:
         """The ended tracks that nothing can go on from any more."""
         begin = self._recent[0][1]
-        done = [track for track in self._held if track.samples[-1].t < begin - WAIT_S]
-        self._held = [track for track in self._held if track.samples[-1].t >= begin - WAIT_S]
+        done = [track for track in self._held if track.samples[-1].t < begin - WAIT_S[1]]
+        self._held = [track for track in self._held if track.samples[-1].t >= begin - WAIT_S[1]]
         return done
 
     def _reach(self, pose: Array) -> Array:
@@ -261,72 +264,13 @@ class GroundTracker:
         track.size_sigma = np.maximum(track.size_sigma * np.sqrt(1 - gain), 0.03)
 
     def _end(self) -> list[Track]:
-        ended: list[Track] = []
-        alive: list[Track] = []
-        pose, size = self.boxes()
-        pixels, _ = project(self.camera, wireframe.corners(pose, size))
-        low, high = pixels.min(axis=1), pixels.max(axis=1)
-        inside = np.clip(np.minimum(high, self.camera.image_size) - np.maximum(low, 0), 0, None)
-        outside = ~(np.prod(inside, axis=1) > LEAST_OPEN * np.prod(high - low, axis=1))
-        feet, _ = project(self.camera, np.column_stack([pose[:, :2], np.zeros(len(pose))]))
-        scale = ground_scale(self.camera, feet)
-        life, twins = self.settings.life, self._twins(pose, size)
-        for k, track in enumerate(self.tracks):
-            if k in twins:
-                same = self._lived_together(track, twins[k])
-                ended.append(self._trimmed(track, f"same vehicle as track {twins[k].id}" if same else "lost"))
-            elif outside[k]:
-                ended.append(self._trimmed(track, "left the picture"))
-            elif self._region is not None and self._left(track, self._region):
-                ended.append(self._trimmed(track, "left the region"))
-            elif scale[k] > life.max_scale:
-                ended.append(self._trimmed(track, "left the measurable zone"))
-            elif track.likeness < UNLIKE:
-                ended.append(self._trimmed(track, "no longer looks like itself"))
-            elif track.refused_since is not None and self._t - track.refused_since > life.max_refused_s:
-                ended.append(self._trimmed(track, "jumped"))
-            elif self._t - track.last_measured > life.max_coast_s:
-                ended.append(self._trimmed(track, "lost"))
-            else:
-                alive.append(track)
-        self.tracks = alive
-        return ended
-
-    def _left(self, track: Track, region: Region) -> bool:
-        """Whether a track has just left the region, or is nowhere near it."""
-        places = np.array([step.posterior.mean[:2] for step in track.steps[-2:]])
-        inside = region.holds(places)
-        return not inside[-1] and bool(inside[0] or not region.near(places[-1]))
-
-    def _twins(self, pose: Array, size: Array) -> dict[int, Track]:
-        """The tracks (by number) in whose place another one stands that looks more like a vehicle, and that one."""
-        shared = footprint_overlap(pose, size, pose, size) > ONE_PLACE
-        worth = [(round(track.likeness, 1), len(track.samples)) for track in self.tracks]
-        found: dict[int, Track] = {}
-        for k in np.argsort([-len(track.samples) for track in self.tracks]):
-            for other in np.flatnonzero(shared[k]):
-                if other != k and int(other) not in found and worth[other] > worth[k]:
-                    found[int(k)] = self.tracks[other]
-        return found
-
-    def _lived_together(self, track: Track, other: Track) -> bool:
-        """Whether a track was in the other's place for most of its life; else it was hidden there in the end."""
-        index = {sample.frame: k for k, sample in enumerate(other.samples)}
-        common = [(k, index[sample.frame]) for k, sample in enumerate(track.samples) if sample.frame in index]
-        (pose, size), (place, its) = (
-            (np.array([self._pose_of(each.steps[k].posterior.mean) for k in rows]), np.tile(each.size, (len(rows), 1)))
-            for each, rows in zip((track, other), zip(*common, strict=True), strict=True)
+        """Take out and return the tracks that have come to an end."""
+        reasons = endings.reasons(
+            self.tracks, self.boxes(), self.camera, self.dynamics, self.settings.life, self._region, self._t
         )
-        shared = np.diagonal(footprint_overlap(pose, size, place, its)) > ONE_PLACE
-        return bool(np.count_nonzero(shared) > len(track.samples) / 2)
-
-    def _trimmed(self, track: Track, reason: str) -> Track:
-        """The track without the predictions after its last measurement."""
-        while len(track.samples) > 1 and not track.samples[-1].measured:
-            track.samples.pop()
-            track.steps.pop()
-        track.ended_by = reason
-        return track
+        ended = [trimmed(track, why) for track, why in zip(self.tracks, reasons, strict=True) if why]
+        self.tracks = [track for track, why in zip(self.tracks, reasons, strict=True) if not why]
+        return ended
 
 
 def _as_good(new: Track, old: Track) -> bool:

@@ -15,7 +15,12 @@ ASIDE_M, TURNED = 1.5, 0.5  # m off the course and rad turned, while unseen
 HALF = 0.5  # of its length: a part of a vehicle that was followed as one lies that far off
 SAME = 0.5  # share of the common frames in which one stands in the place of the other
 BELIEVED = 0.7  # share of the outline seen, on average, that makes an earlier stretch worth keeping
-WAIT_S = 3.0  # s unseen
+WAIT_S = 3.0, 6.0  # s unseen, of what moves and of what stands in a queue
+SLOW, STARTS, ALIKE = (
+    2.0,
+    1.0,
+    0.25,
+)  # m/s below which it stands; m/s^2 that it starts with; of the logarithm of its length
 
 
 def part_before(
@@ -43,12 +48,15 @@ def part_before(
         gap = begin.t - old.samples[-1].t
         planar, _ = dynamics.planar(was[-1])
         speed = max(float(np.hypot(*planar[2:])), 1e-6)
-        ahead = planar[2:] / speed
+        slow = speed < SLOW  # what hardly moves goes where it faces
+        ahead = np.array([np.cos(place[-1, 2]), np.sin(place[-1, 2])]) if slow else planar[2:] / speed
         offset = pose[0, :2] - planar[:2] - gap * planar[2:]
         along, across = float(offset @ ahead), float(ahead[0] * offset[1] - ahead[1] * offset[0])
         turned = abs(wrap(pose[0, 2] - np.arctan2(ahead[1], ahead[0])))
-        near = abs(along) < CLOSE_M + DRIFT * gap * speed and abs(across) < ASIDE_M and turned < TURNED
-        fits = good and gap < WAIT_S and near
+        ahead_m = CLOSE_M + DRIFT * gap * speed
+        near = -ahead_m < along < ahead_m + slow * STARTS * gap**2 / 2 and abs(across) < ASIDE_M and turned < TURNED
+        alike = abs(np.log(size[0] / old.size[0])) < ALIKE
+        fits = good and near and (gap < WAIT_S[0] or (slow and alike and gap < WAIT_S[1]))
         if not fits:
             return None
     return (kept, place[:count]) if fits and good else ([], np.zeros((0, 3)))

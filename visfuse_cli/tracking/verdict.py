@@ -20,6 +20,7 @@ TURN_M = 0.25  # m a radian: the middle of a fitted box shifts as the vehicle sh
 SIZE_DOUBT = 0.03  # of a size: no vehicle is quite a box
 GOOD_ENOUGH, LONGER_FOR = 0.01, 1.5  # standard deviation of a speed over itself
 DOUBTFUL_ENDS, SHORT_S = ("jumped", "no longer looks like itself"), 1.0  # s: a track that does so sooner is nothing
+FOUND, LASTING, SHORT_LOOK_S = 0.6, 0.22, 2.0  # of a logistic fit to rendered traffic, true tracks against false ones
 JUMP_S = 0.3  # s a change of speed is looked at
 
 
@@ -31,18 +32,16 @@ class SpeedSettings(Section):
     min_distance_m: float = Field(2.0, gt=0, le=1000, description="m: shortest way a speed is measured over")
     max_sigma: float = Field(0.15, gt=0, le=10, description="standard deviation over speed: above, too uncertain")
     max_acceleration: float = Field(9.0, gt=0, le=100, description="m/s^2: above, the track has jumped")
-    min_likeness: float = Field(
-        0.75, ge=0, le=1, description="least share of its outline that must be found, on average"
+    min_evidence: float = Field(
+        1.34,
+        ge=0,
+        le=2,
+        description="what was seen of a track's outline: 0.6 times the share of what could be seen, plus the share of "
+        "all of it, plus 0.22 times the logarithm of the time it was seen over 2 s",
     )
     min_measured: float = Field(0.6, ge=0, le=1, description="share of a track's frames that must be measured")
-    min_support: float = Field(
-        0.4, ge=0, le=1, description="that share, times the share of its whole outline that was found, must reach"
-    )
-    min_proof: float = Field(
-        1.2, ge=0, le=20, description="by how much it must, times the root of the frames: a part seen for long is proof"
-    )
     max_misfit: float = Field(0.2, gt=0, le=5, description="outline misfit over outline size: above, no such box")
-    max_size_z: float = Field(4.0, gt=0, le=100, description="deviations of a size from its class")
+    max_size_z: float = Field(5.0, gt=0, le=100, description="deviations of a size from its class")
     max_refused: float = Field(
         0.5, gt=0, le=1, description="share of measurements outside the gate: above, inconsistent"
     )
@@ -159,11 +158,9 @@ def _reason(path: Path, verdict: Verdict, settings: SpeedSettings, trusted: bool
     if path.size_z > settings.max_size_z:
         length, width, height = path.size
         return f"no {path.class_name} measures {length:.1f} x {width:.1f} x {height:.1f} m: a part, or several"
-    if path.likeness < settings.min_likeness:
-        return f"unlike a {path.class_name}: {100 * path.likeness:.0f} % of its outline was seen"
-    proof = (path.likeness * path.support - settings.min_support) * np.sqrt(np.count_nonzero(path.measured))
-    if proof < settings.min_proof:
-        return f"too little seen: {100 * path.support:.0f} % of a {path.class_name}'s outline in {frames} frames"
+    if evidence(path) < settings.min_evidence:
+        of, seen = f"a {path.class_name}'s outline", f"{100 * path.likeness:.0f} % of what could be seen"
+        return f"too little seen: {seen} of {of} and {100 * path.support:.0f} % of all of it"
     outline = _outline_px(path)
     if np.isfinite(path.misfit_px) and path.misfit_px > settings.max_misfit * outline + 3:
         return f"no box fits: outline off by {path.misfit_px:.0f} px (several vehicles, a shadow or a reflection)"
@@ -171,6 +168,12 @@ def _reason(path: Path, verdict: Verdict, settings: SpeedSettings, trusted: bool
         half = verdict.sigma * Z95 * KMH
         return f"too uncertain: {verdict.speed * KMH:.0f} +- {half:.0f} km/h"
     return ""
+
+
+def evidence(path: Path) -> float:
+    """How much was seen of a track's outline: half of it for long is worth as much as most of it for short."""
+    seen = path.measured.mean() * (path.t[-1] - path.t[0])
+    return float(FOUND * path.likeness + path.support + LASTING * np.log(max(seen, SHORT_LOOK_S) / SHORT_LOOK_S))
 
 
 def _jumps(path: Path) -> Array:

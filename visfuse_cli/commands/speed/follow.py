@@ -1,0 +1,140 @@
+"""One recording from its first frame to its last: steadied, compared with the background, followed, concluded."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from datetime import datetime
+from typing import Any
+
+import numpy as np
+
+from visfuse_cli.files.spool import TrackSpool
+from visfuse_cli.files.video import VideoSource
+from visfuse_cli.pipeline import Run, helper, with_next
+from visfuse_cli.records import Array, Frame, GroundCamera, Image, TimeAudit
+from visfuse_cli.tracking.camera_watch import CameraWatch
+from visfuse_cli.tracking.foreground import Detections, Detector, HandOver, MovingRegions
+from visfuse_cli.tracking.ground import GroundTracker
+from visfuse_cli.tracking.headlights import Headlights
+from visfuse_cli.tracking.ledger import Ledger, Recording
+from visfuse_cli.tracking.options import SpeedOptions
+from visfuse_cli.tracking.privacy import Strangers
+from visfuse_cli.tracking.targets import Abandoned, Track
+from visfuse_cli.tracking.zones import Region
+from visfuse_cli.vision.empty import empty_picture
+from visfuse_cli.vision.steady import at_rest
+
+WARMUP_PICTURES = 31
+
+
+@dataclass(slots=True)
+class Findings:
+    """What a run has found so far, by clip where it is a clip's own."""
+
+    ledger: Ledger
+    audits: dict[str, TimeAudit] = field(default_factory=dict)
+    began: dict[str, datetime | None] = field(default_factory=dict)
+    doubts: list[str] = field(default_factory=list)  # about times of day
+    watches: dict[str, CameraWatch] = field(default_factory=dict)
+    suns: dict[str, dict[str, Any] | None] = field(default_factory=dict)
+    strangers: dict[str, Strangers] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class Clip:
+    """One recording and everything its frames need."""
+
+    name: str
+    source: VideoSource
+    camera: GroundCamera
+    config: SpeedOptions
+    boxes: dict[int, Array] | None
+
+
+def follow(clip: Clip, run_: Run, spool: TrackSpool, findings: Findings, first_id: int, label: str | None) -> int:
+    """Follow everything in one clip; returns the next free id."""
+    tracker = GroundTracker(clip.camera, clip.config, first_id)
+    findings.ledger.drawn[clip.name] = []
+    strangers = findings.strangers[clip.name] = Strangers(clip.camera)
+    with helper() as hand_over:
+        with run_.stage("warm up"):
+            empty = empty_picture(at_rest(sampled(clip.source, clip.config.background.warmup_s)))
+            watch = findings.watches[clip.name] = CameraWatch(empty)
+            look, lamps = _detector(clip, empty, hand_over), Headlights(empty, clip.camera)
+        of = Recording(clip.name, label, clip.camera, findings.began[clip.name], watch.image_from_rest)
+        for frame, following in with_next(_steadied(clip.source, watch, run_)):
+            tracker.predict(frame.t)
+            with run_.stage("detect"):
+                evidence = look.evidence(frame, tracker.expected())
+            if following is not None:
+                look.foresee(following)
+            with run_.stage("track"):
+                ended = tracker.update(frame.index, evidence)
+                if clip.config.privacy.blur:
+                    strangers.add(frame.index, tracker.unexplained)
+                lamps.look(frame, tracker.tracks, tracker.headings())
+            with run_.stage("conclude"):
+                _settle(*ended, of, tracker, lamps, run_, spool, findings.ledger)
+            with run_.stage("learn"):
+                look.learn(frame, tracker)
+        _settle(*tracker.finish(), of, tracker, lamps, run_, spool, findings.ledger)
+    findings.suns[clip.name] = look.report()
+    audit = findings.audits[clip.name] = clip.source.audit()
+    for warning in (*audit.warnings, *watch.warnings(clip.name)):
+        run_.warn(warning)
+    return tracker.next_id
+
+
+def _steadied(source: VideoSource, watch: CameraWatch, run_: Run) -> Iterator[Frame]:
+    """The frames in which the scene is recognised, as the camera at rest sees them."""
+    for frame in run_.prepared(source, watch.steadied):
+        run_.count("frames")
+        if frame is not None:
+            yield frame
+
+
+def _detector(clip: Clip, empty: Image, hand_over: HandOver) -> Detector:
+    config = clip.config
+    region = Region(np.array(config.region)) if config.region else None
+    if clip.boxes is not None:
+        return Detections(clip.camera, clip.boxes, region)
+    return MovingRegions(
+        clip.camera, config.background, config.regions, config.target.smallest, empty, region, hand_over
+    )
+
+
+def sampled(source: VideoSource, warmup_s: float) -> Iterator[Any]:
+    """Pictures spread over the first `warmup_s` seconds; the first picture at least."""
+    span = warmup_s * source.nominal_rate
+    if source.frame_count is not None:
+        span = min(span, source.frame_count)
+    step = max(1, round(span / WARMUP_PICTURES))
+    first: float | None = None
+    for number, frame in enumerate(source.frames()):
+        first = frame.t if first is None else first
+        if number and frame.t - first >= warmup_s:
+            return
+        if number % step == 0:
+            yield frame.image
+
+
+def _settle(
+    tracks: list[Track],
+    abandoned: list[Abandoned],
+    of: Recording,
+    tracker: GroundTracker,
+    lamps: Headlights,
+    run_: Run,
+    spool: TrackSpool,
+    ledger: Ledger,
+) -> None:
+    """Turn what ended into records and table rows."""
+    for track in tracks:
+        record = ledger.take(track, of, tracker.dynamics, lamps.only_light(track.id))
+        if record is not None:
+            spool.add(record)
+            run_.count("rejected" if record["summary"]["rejected"] else "vehicles")
+    for candidate in abandoned:
+        ledger.give_up(candidate, of)
+        run_.count("regions that never became a track")
