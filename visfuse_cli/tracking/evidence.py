@@ -55,12 +55,13 @@ class LabelEvidence:
         grey: Image | None = None,
     ) -> None:
         self._labels, self._grey = Labels(labels), grey
+        self._owned: tuple[bytes, Image] | None = None  # the boxes asked about last, and whose each pixel is
         self._camera, self._cut = camera, cut
         self._cleaning = gap_m, speck_m, smallest_m
 
     def pack(self) -> None:
         self._labels.pack()
-        self._grey = None
+        self._grey = self._owned = None
 
     def picture(self) -> Image | None:
         """The grey picture (H, W) of the present frame; None of a past one, or where there is none."""
@@ -79,7 +80,13 @@ class LabelEvidence:
         return contour.search(sights, np.zeros(len(pose), int), frames[0]._camera, pose, size, reach)
 
     def _among(self, boxes: Boxes) -> Sight:
-        return Sight(self._labels, contour.owners(self._camera, *boxes))
+        """What is seen among boxes; the present frame is asked again and again about the same ones."""
+        key = boxes[0].tobytes() + boxes[1].tobytes()
+        if self._grey is None:
+            return Sight(self._labels, contour.owners(self._camera, *boxes))
+        if self._owned is None or self._owned[0] != key:
+            self._owned = key, contour.owners(self._camera, *boxes)
+        return Sight(self._labels, self._owned[1])
 
     def fill(self, pose: Array, size: Array, taken: Boxes) -> Fill:
         """A quick look at each of N boxes as if it alone stood among those `taken`."""

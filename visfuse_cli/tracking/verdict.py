@@ -20,7 +20,8 @@ TURN_M = 0.25  # m a radian: the middle of a fitted box shifts as the vehicle sh
 SIZE_DOUBT = 0.03  # of a size: no vehicle is quite a box
 GOOD_ENOUGH, LONGER_FOR = 0.01, 1.5  # standard deviation of a speed over itself
 DOUBTFUL_ENDS, SHORT_S = ("jumped", "no longer looks like itself"), 1.0  # s: a track that does so sooner is nothing
-FOUND, LASTING, SHORT_LOOK_S = 0.6, 0.22, 2.0  # of a logistic fit to rendered traffic, true tracks against false ones
+LASTING, SHORT_LOOK_S = 0.22, 2.0  # of a logistic fit to rendered traffic, true tracks against false ones
+UNSEEN_S = 1.5  # s: a stretch goes over no longer gap
 JUMP_S = 0.3  # s a change of speed is looked at
 
 
@@ -33,11 +34,11 @@ class SpeedSettings(Section):
     max_sigma: float = Field(0.15, gt=0, le=10, description="standard deviation over speed: above, too uncertain")
     max_acceleration: float = Field(9.0, gt=0, le=100, description="m/s^2: above, the track has jumped")
     min_evidence: float = Field(
-        1.34,
+        1.65,
         ge=0,
-        le=2,
-        description="what was seen of a track's outline: 0.6 times the share of what could be seen, plus the share of "
-        "all of it, plus 0.22 times the logarithm of the time it was seen over 2 s",
+        le=3,
+        description="share of its outline that was found, of what could be seen plus of all of it, plus 0.22 times the "
+        "logarithm of the time it was seen over 2 s",
     )
     min_measured: float = Field(0.6, ge=0, le=1, description="share of a track's frames that must be measured")
     max_misfit: float = Field(0.2, gt=0, le=5, description="outline misfit over outline size: above, no such box")
@@ -94,8 +95,10 @@ def _best_stretch(
     duration, distance = path.t[j] - path.t[i], length[j] - length[i]
     allowed = (duration >= settings.min_duration_s) & (distance >= settings.min_distance_m)
     jumps = _jumps(path) > settings.max_acceleration
-    jumped = np.cumsum(jumps)
-    whole = allowed & (jumped[i] == jumped[j]) & ~jumps[i]
+    gaps = np.zeros(len(path.t), dtype=int)
+    gaps[seen[1:]] = np.diff(path.t[seen]) > UNSEEN_S
+    broken = np.cumsum(jumps + gaps)
+    whole = allowed & (broken[i] == broken[j]) & ~jumps[i]
     allowed = whole if whole.any() else allowed
     if not allowed.any():
         allowed = (i == grid[0]) & (j == grid[-1])
@@ -173,7 +176,7 @@ def _reason(path: Path, verdict: Verdict, settings: SpeedSettings, trusted: bool
 def evidence(path: Path) -> float:
     """How much was seen of a track's outline: half of it for long is worth as much as most of it for short."""
     seen = path.measured.mean() * (path.t[-1] - path.t[0])
-    return float(FOUND * path.likeness + path.support + LASTING * np.log(max(seen, SHORT_LOOK_S) / SHORT_LOOK_S))
+    return float(path.likeness + path.support + LASTING * np.log(max(seen, SHORT_LOOK_S) / SHORT_LOOK_S))
 
 
 def _jumps(path: Path) -> Array:
