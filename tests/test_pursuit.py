@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from samples.head import room
-from visfuse_cli.gazing import find
+from visfuse_cli.gazing import conclude, find
 from visfuse_cli.moving.pursuit import Pursuit
 from visfuse_cli.moving.settings import ImmConfig
 from visfuse_cli.moving.tracker import TWINS_S, Tracker
@@ -138,3 +138,20 @@ def test_what_was_first_seen_in_part_gives_way_to_the_whole():
     assert not find._outgrows(np.array([9.0, 29, 31, 52]), held)  # as large as it
     assert not find._outgrows(np.array([9.0, 10, 61, 52]), held)  # two side by side
     assert not find._outgrows(np.array([22.0, 10, 42, 52]), held)  # somebody else
+
+
+def test_a_gaze_that_passes_the_half_turn_is_predicted_as_any_other():
+    t = np.arange(0, 4, 0.04)
+    places = np.column_stack([1.5 * (t - 2), np.full_like(t, -10.0)])  # behind, from one side to the other
+    later = places + 0.2 * np.array([1.5, 0.0])
+    target = SimpleNamespace(
+        config=SimpleNamespace(latency=0.2),
+        looks=[SimpleNamespace(t=now, z=np.array([*place, 1.5, 0.0])) for now, place in zip(t, places, strict=True)],
+        steps=list(t),
+        ahead=[SimpleNamespace(mean=place) for place in later],
+        head=SimpleNamespace(centre=np.array([0.0, 0.0, 4.0])),
+        height=0.9,
+    )
+    plane, ground = conclude.prediction_errors(target)
+    assert ground < 1e-5
+    assert ground < plane < 5e-3

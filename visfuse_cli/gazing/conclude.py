@@ -10,6 +10,7 @@ import numpy as np
 from visfuse_cli.gazing.head import ground_shift
 from visfuse_cli.gazing.target import Look, Target, belief
 from visfuse_cli.maths import gaussian, motion
+from visfuse_cli.maths.angles import wrap
 from visfuse_cli.records import Array, Gaussian, GroundMap
 
 Z95 = 1.959963984540054
@@ -130,13 +131,14 @@ def prediction_errors(target: Target) -> tuple[float, float] | None:
         return None
     t = np.array([target.looks[k].t for k in seen])
     angles = np.array([_direction(target, z[:2]) for k in seen if (z := target.looks[k].z) is not None])
+    angles = np.unwrap(angles, axis=0)  # the ground's axes may lie any way
     used = [i for i in range(len(seen)) if t[i] - t[0] >= SETTLED_S and t[i] + latency <= t[-1]]
     if len(used) < 5:
         return None
     truth = np.column_stack([np.interp(t[used] + latency, t, angles[:, c]) for c in (0, 1)])
     told = np.array([_direction(target, b.mean[:2]) for i in used if (b := target.ahead[seen[i]]) is not None])
     plane = min(_angles_ahead(t, angles, used, latency, q, truth) for q in ANGLE_Q)
-    return plane, float(np.sqrt(np.mean(np.sum((told - truth) ** 2, axis=1))))
+    return plane, float(np.sqrt(np.mean(np.sum(wrap(told - truth) ** 2, axis=1))))
 
 
 def _direction(target: Target, place: Array) -> Array:
