@@ -36,7 +36,8 @@ class Walker:
         # Pchip stands still where two knots are one; averaging over half a second rounds its and a polyline's corners.
         lags = np.linspace(-0.25, 0.25, 11)
         when = np.clip(t[:, None] + lags, self.times[0], self.times[-1])
-        return np.column_stack([curve(when).mean(axis=1), curve.derivative()(when).mean(axis=1)])
+        walks = when == t[:, None] + lags  # before and after the walk somebody stands
+        return np.column_stack([curve(when).mean(axis=1), (curve.derivative()(when) * walks[..., None]).mean(axis=1)])
 
     def pieces(self, state: Array, heading: float, way: float) -> list[Piece]:
         """The body at one state (4,), facing `heading` rad, after `way` m of walk."""
