@@ -207,18 +207,18 @@ def test_one_camera_alone_follows_on_and_says_how_doubtfully(scene, boxes, tmp_p
     shutil.copy(boxes / "calibration.toml", tmp_path)
     done = run(tmp_path, "--out", tmp_path / "run", "--no-report", "--set", "video.fps=12", "--set", "life.max_doubt=9")
     assert done.returncode == 0, done.stderr
-    truth, alone = truth_of(scene), 0
+    truth, inside = truth_of(scene), []
     for track in json.loads((tmp_path / "run" / "tracks.json").read_text(encoding="utf-8"))["tracks"]:
         states = [state for state in track["states"] if state["frame"] >= last + 6 and list(state["box"]) == ["cam1"]]
-        alone += len(states)
         for state in states:
             who = min((1, 2), key=lambda k: np.linalg.norm(truth[state["frame"], k][:3] - state["position"]))
             off = np.array(state["position"]) - truth[state["frame"], who][:3]
             sigma = np.sqrt(np.diag(state["covariance"])[:3])
             assert np.linalg.norm(off) < 0.5
-            assert np.all(np.abs(off) < 4 * sigma)
+            inside.append(np.all(np.abs(off) < 3 * sigma))
             assert np.linalg.norm(sigma[:2]) > 0.06  # more than what several cameras leave
-    assert alone > 20
+    assert len(inside) > 20
+    assert np.mean(inside) > 0.8
 
 
 @pytest.mark.skipif(not SQUARE.is_dir(), reason="the recordings lie beside the project; they are not here")

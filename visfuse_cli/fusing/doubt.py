@@ -31,9 +31,9 @@ def stated(
     alone = number == 1
     information[alone, 2, 2] += LEVEL_M**-2  # one camera alone, and the height as it is known
     by_ends[alone, 2, 0] += 0.5 * centroid * LEVEL_M**-2
-    by_look, level = np.zeros((count, 3, 2)), np.array([0.0, 0.0, LEVEL_M**-1])
-    np.add.at(by_look[:, :, 0], sights.owner, LONE_PX * J_W[:, :, 1])
-    by_look[:, :, 1] = level
+    by_look = np.zeros((count, 3, 3))  # across, upwards, and the level of the ground
+    np.add.at(by_look[:, :, :2], sights.owner, LONE_PX * J_W)
+    by_look[:, 2, 2] = LEVEL_M**-1
     moved = np.asarray(np.linalg.solve(information, np.concatenate([by_ends, by_look], axis=2)), dtype=float)
     by_ends, by_look = moved[..., :3], moved[..., 3:]
     by_ends[number == 0] = by_ends[number > 0].mean(axis=0)
