@@ -27,12 +27,14 @@ NIGHT = 45  # grey levels: half of a scene at night is darker, and what is brigh
 LIT_SHARE = 0.06  # of the pictures in which a place is that much brighter, to take what is seen more often for shadow
 
 
-def empty_picture(images: Sequence[Image]) -> Image:
+def empty_picture(images: Sequence[Image], neighbours: bool = True) -> Image:
     """The scene without its traffic, from pictures (H, W, 3) in the order of time.
 
     In each small block the empty scene is the colour that is seen often and over the longest time; where no colour is
     seen in half of the pictures, or where it may be a shadow's, one like the surroundings is preferred: windows and
     tyres come back as well, and a queue casts its shadow for long. The picture is the mean of those that show it.
+    Without `neighbours`, what is seen beside a place in the same picture does not count: a vehicle that comes straight
+    at the camera covers its place and all that lies beside it in most of a short recording.
     """
     high, wide = images[0].shape[:2]
     coarse = (-(-wide // BLOCK), -(-high // BLOCK))
@@ -59,7 +61,8 @@ def empty_picture(images: Sequence[Image]) -> Image:
         left = ~(sure | in_light)
         if left.any():
             likely = np.exp(-off[:, None, left] / UNLIKE)
-            shows[:, left] = _recurring(blocks[:, None, left], likely, alike[None, left], beside[:, None, left])[:, 0]
+            weight = beside[:, None, left] if neighbours else None
+            shows[:, left] = _recurring(blocks[:, None, left], likely, alike[None, left], weight)[:, 0]
     total, count = np.zeros((high, wide, 3), np.float32), np.zeros((high, wide), np.float32)
     for image, shown in zip(images, shows, strict=True):
         mask = cv2.resize(shown.astype(np.uint8), (wide, high), interpolation=cv2.INTER_NEAREST)

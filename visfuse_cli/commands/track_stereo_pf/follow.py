@@ -120,7 +120,7 @@ def _empty(scene: Scene, request: RunRequest, straight: Straight) -> Image:
             pictures.append(straight.picture(frame.image))
     if not pictures:
         raise InputError(f"{scene.views['left']}: holds no frame")
-    return empty_picture(pictures)
+    return empty_picture(pictures, neighbours=False)
 
 
 def _check_epipolar(scene: Scene, pictures: dict[str, Image], run_: Run) -> None:
