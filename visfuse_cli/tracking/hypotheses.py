@@ -18,7 +18,6 @@ from visfuse_cli.vision import wireframe
 from visfuse_cli.vision.contour import Look
 
 REACHES_PX = (24.0, 12.0, 6.0)  # how far around a hypothesis its border is looked for, coarse to fine
-PROMISING = 16  # of the hypotheses are looked at more closely
 BORDER_SEEN, AREA_MOVED = 0.6, 0.6  # shares of its border and its area that must be found
 CLEAR = 0.4  # share of its border that must have background outside: a window of a grey car has paint
 FOOT_SEEN = 0.5  # share of its border on the ground that must be found: a part of a vehicle stands on nothing
@@ -80,20 +79,14 @@ def refined(
     priors = [measure.prior_arrays(prior) for prior in classes]
     mean, sigma = (np.stack([pair[k] for pair in priors])[which] for k in (0, 1))
     size = mean
-    around = np.broadcast_to(around_area, (len(pose),))
     for reach in REACHES_PX:
         look = evidence.probe(pose, size, np.full(len(pose), reach), taken)
         fit = measure.fit_poses(camera, look.outlines, pose, mean, sigma, settings.pose, HEADING_SIGMA)
         pose, size = np.where(fit.ok[:, None], fit.pose, pose), np.where(fit.ok[:, None], fit.size, size)
-        if reach == REACHES_PX[0] and len(pose) > PROMISING:
-            gain = np.nan_to_num(_gain(look, area_of(camera, pose, size) * look.open), nan=-np.inf)
-            kept = np.sort(np.argsort(-gain, kind="stable")[:PROMISING])
-            which, around = which[kept], around[kept]
-            pose, size, mean, sigma = (each[kept] for each in (pose, size, mean, sigma))
     usual = np.all(np.abs(size - mean) < UNUSUAL * sigma, axis=1)
     area = area_of(camera, pose, size) * look.open
     # A window of a grey car looks like a small vehicle: what explains little of all that moves must be seen clearly.
-    doubt = 1 - np.clip(area * look.moved / np.maximum(around, 1.0), 0, 1)
+    doubt = 1 - np.clip(area * look.moved / np.maximum(around_area, 1.0), 0, 1)
     clear = (look.border > BORDER_SEEN + PART * doubt) & (look.clear > CLEAR + PART * doubt)
     clear |= (look.border > BORDER_SEEN + PART / 2) & (look.paint > SOLID) & (mean[:, 0] > LARGE_M)
     stands = (
