@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from visfuse_cli.records import Array, Image
 
 BLOCK = 4  # px: side of the places in which the empty scene is sought
-ALIKE, SHIFTED_PX = 6, 0.3  # grey levels a channel between two sights of a place, and px it may have moved by
+ALIKE = 6  # grey levels a channel between two sights of a place
 SURE = 0.5  # share of the pictures that show what is the scene without doubt
 UNLIKE = 20.0  # grey levels from the surroundings that make a colour e times less likely
 AROUND, NEAR = (24.0, 6.0), 0.2  # blocks that surroundings reach, wide and near, and the share of them that is enough
@@ -27,19 +27,20 @@ NIGHT = 45  # grey levels: half of a scene at night is darker, and what is brigh
 LIT_SHARE = 0.06  # of the pictures in which a place is that much brighter, to take what is seen more often for shadow
 
 
-def empty_picture(images: Sequence[Image], neighbours: bool = True) -> Image:
+def empty_picture(images: Sequence[Image], moved_px: float = 0.0, neighbours: bool = True) -> Image:
     """The scene without its traffic, from pictures (H, W, 3) in the order of time.
 
     In each small block the empty scene is the colour that is seen often and over the longest time; where no colour is
     seen in half of the pictures, or where it may be a shadow's, one like the surroundings is preferred: windows and
     tyres come back as well, and a queue casts its shadow for long. The picture is the mean of those that show it.
+    `moved_px` is how far a place may have moved between two pictures, as it does where shake was compensated.
     Without `neighbours`, what is seen beside a place in the same picture does not count: a vehicle that comes straight
     at the camera covers its place and all that lies beside it in most of a short recording.
     """
     high, wide = images[0].shape[:2]
     coarse = (-(-wide // BLOCK), -(-high // BLOCK))
     blocks = np.stack([cv2.resize(image, coarse, interpolation=cv2.INTER_AREA) for image in images])
-    alike = _tolerance(blocks)
+    alike = _tolerance(blocks, moved_px)
     shows = _recurring(blocks, np.ones(blocks.shape[:3], np.float32), alike)
     often = shows.sum(axis=0)
     colour = np.einsum("nvu,nvuc->vuc", shows.astype(np.float32), blocks.astype(np.float32)) / often[..., None]
@@ -71,11 +72,11 @@ def empty_picture(images: Sequence[Image], neighbours: bool = True) -> Image:
     return np.asarray(np.rint(total / count[..., None]), dtype=np.uint8)
 
 
-def _tolerance(blocks: Image) -> Image:
-    """Grey levels (h, w) by which two sights of a block may differ: more where a small shift changes it."""
+def _tolerance(blocks: Image, moved_px: float) -> Image:
+    """Grey levels (h, w) by which two sights of a block may differ: more where a shift changes it."""
     middle = np.median(blocks[:: max(1, len(blocks) // 7)], axis=0).astype(np.float32)
     slopes = [np.abs(cv2.Sobel(middle, cv2.CV_32F, *axis)).max(axis=-1) / 8 / BLOCK for axis in ((1, 0), (0, 1))]
-    return np.asarray(np.minimum(ALIKE + SHIFTED_PX * np.hypot(*slopes), 3 * ALIKE), dtype=np.uint8)
+    return np.asarray(np.minimum(ALIKE + moved_px * np.hypot(*slopes), 3 * ALIKE), dtype=np.uint8)
 
 
 def _mean(values: NDArray[Any], which: NDArray[np.bool_]) -> Array:
