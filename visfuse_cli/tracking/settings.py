@@ -78,10 +78,10 @@ class FilterSettings(Section):
     )
     sigma_a: float = Field(0.8, gt=0, le=50, description="m/s^2 per root Hz: how hard the target accelerates")
     sigma_steer: float = Field(
-        0.4, gt=0, le=5, description="rad/s per root Hz: how fast the steering angle changes at walking pace (not imm)"
+        0.15, gt=0, le=5, description="rad/s per root Hz: how fast the steering angle changes at walking pace (not imm)"
     )
     sigma_corner: float = Field(
-        1.5,
+        6.0,
         gt=0,
         le=1000,
         description="m/s^3 per root Hz: how fast the lateral acceleration changes, at speed (not imm)",

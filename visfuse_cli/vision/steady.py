@@ -117,8 +117,9 @@ def moved(motion: Array, points: Array) -> Array:
     return np.asarray(mapped[..., :2] / mapped[..., 2:])
 
 
-def at_rest(pictures: Iterable[Image]) -> list[Image]:
-    """Pictures (H, W, 3) of one camera, each as seen from the middle of the places where the camera was at first.
+def at_rest(pictures: Iterable[Image]) -> tuple[list[Image], float]:
+    """Pictures (H, W, 3) of one camera, each as seen from the middle of the places where the camera was at first, and
+    how far (px) the camera moves between them, by the median.
 
     What follows a knock does not count. All are as bright as the first; one in which the scene cannot be found again is
     left out.
@@ -130,7 +131,9 @@ def at_rest(pictures: Iterable[Image]) -> list[Image]:
     found = [(picture, motion) for picture, motion in zip(waiting, motions, strict=True) if motion is not None]
     places = np.array([moved(motion, steady.middle) for _, motion in found])
     rest = np.median([motion for _, motion in found[: _before_knocks(places)]], axis=0)
-    return [steady.laid_back(picture, motion @ np.linalg.inv(rest)) for picture, motion in found]
+    ways = [motion @ np.linalg.inv(rest) for _, motion in found]
+    shake = float(np.median([steady.shift(way) for way in ways]))
+    return [steady.laid_back(picture, way) for (picture, _), way in zip(found, ways, strict=True)], shake
 
 
 def _before_knocks(places: Array) -> int:

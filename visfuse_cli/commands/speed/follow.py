@@ -26,7 +26,7 @@ from visfuse_cli.vision.empty import empty_picture
 from visfuse_cli.vision.steady import at_rest
 
 WARMUP_PICTURES = 31
-STEADIED_PX = 0.3  # what is left of a shake between two pictures
+STEADIED_PX = 0.3  # what is left of a shake between two pictures, at most
 
 
 @dataclass(slots=True)
@@ -60,7 +60,8 @@ def follow(clip: Clip, run_: Run, spool: TrackSpool, findings: Findings, first_i
     strangers = findings.strangers[clip.name] = Strangers(clip.camera)
     with helper() as hand_over:
         with run_.stage("warm up"):
-            empty = empty_picture(at_rest(sampled(clip.source, clip.config.background.warmup_s)), STEADIED_PX)
+            pictures, shake = at_rest(sampled(clip.source, clip.config.background.warmup_s))
+            empty = empty_picture(pictures, min(STEADIED_PX, shake))
             watch = findings.watches[clip.name] = CameraWatch(empty)
             look, lamps = _detector(clip, empty, hand_over), Headlights(empty, clip.camera)
         of = Recording(clip.name, label, clip.camera, findings.began[clip.name], watch.image_from_rest)
