@@ -7,6 +7,7 @@ without a centre thinks the target at its own: zero, with a variance.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import lru_cache
 
 import numpy as np
 
@@ -26,6 +27,7 @@ INDEX = {
     "ca": tuple(range(9)),
     "periodic": (*range(6), *range(9, 12)),
 }
+INTERVALS = 64  # lengths of a step whose motions are remembered
 
 
 class Models:
@@ -34,6 +36,7 @@ class Models:
     def __init__(self, settings: FilterSettings) -> None:
         self._settings = settings
         self.names = tuple(INDEX) if settings.kind == "imm" else (settings.kind,)
+        self._ways = lru_cache(INTERVALS)(self._motions)  # shared by all steps of one length: they are kept for long
 
     def start(self, position: Gaussian, velocity: Gaussian) -> Bank:
         """Every model from a place (3,) and a velocity (3,), equally likely."""
@@ -44,8 +47,7 @@ class Models:
 
     def predict(self, bank: Bank, dt: float) -> Step:
         """The bank dt (s) later: mixed, then each by its own motion. Jia 2008, eqs. 23-26, 33-34."""
-        motions = [imm.embedded(*self._motion(name, dt), INDEX[name], SPARE) for name in self.names]
-        F, Q = (np.stack(part) for part in zip(*motions, strict=True))
+        F, Q = self._ways(dt)
         return imm.predict(bank, self._changes(dt), lambda x: (times(F, x), F, Q))
 
     def smoothed(self, steps: Sequence[Step], t: Array) -> list[Bank]:
@@ -54,6 +56,13 @@ class Models:
 
     def _changes(self, dt: float) -> Array:
         return imm.changes(len(self.names), dt, self._settings.sojourn)
+
+    def _motions(self, dt: float) -> tuple[Array, Array]:
+        """F and Q (r, N, N) of all models over dt (s)."""
+        motions = [imm.embedded(*self._motion(name, dt), INDEX[name], SPARE) for name in self.names]
+        F, Q = (np.stack(part) for part in zip(*motions, strict=True))
+        F.flags.writeable = Q.flags.writeable = False
+        return F, Q
 
     def _motion(self, name: str, dt: float) -> tuple[Array, Array]:
         s = self._settings
