@@ -137,7 +137,7 @@ def test_half_an_outline_is_believed_when_it_was_seen_for_long():
     assert seen(0.98, 0.9, 1.0) > least
     assert seen(0.85, 0.6, 1.5) < least
     assert seen(0.9, 0.6, 12.0) > least
-    assert seen(0.7, 0.5, 12.0) < least
+    assert seen(0.6, 0.5, 12.0) < least
 
 
 def test_what_never_moves_is_given_up_with_its_place():

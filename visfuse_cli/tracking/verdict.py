@@ -34,7 +34,7 @@ class SpeedSettings(Section):
     max_sigma: float = Field(0.15, gt=0, le=10, description="standard deviation over speed: above, too uncertain")
     max_acceleration: float = Field(9.0, gt=0, le=100, description="m/s^2: above, the track has jumped")
     min_evidence: float = Field(
-        1.65,
+        1.54,
         ge=0,
         le=3,
         description="share of its outline that was found, of what could be seen plus of all of it, plus 0.22 times the "
