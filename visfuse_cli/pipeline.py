@@ -9,19 +9,21 @@ import sys
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from datetime import UTC, datetime
+from pathlib import Path
 from types import FrameType, TracebackType
 from typing import Any, Protocol, TypeVar
 
 import cv2
 from tqdm import tqdm
 
+from visfuse_cli.files.run_json import write_run_json
 from visfuse_cli.files.video import VideoSource
-from visfuse_cli.records import Frame, FrameSet
+from visfuse_cli.records import Frame, FrameSet, RunRequest, TimeAudit
 from visfuse_cli.threads import thread_cap
 
 T = TypeVar("T")
@@ -82,6 +84,39 @@ class Run:
     def count(self, name: str, n: int = 1) -> None:
         """Add to a count of run.json."""
         self.counts[name] += n
+
+    def audited(self, sources: Mapping[str, VideoSource]) -> dict[str, TimeAudit]:
+        """The time audits of sources that were read, by name; what is doubtful about them is warned of."""
+        audits = {name: source.audit() for name, source in sources.items()}
+        for audit in audits.values():
+            for warning in audit.warnings:
+                self.warn(warning)
+        return audits
+
+    def write_json(
+        self,
+        folder: Path,
+        request: RunRequest,
+        inputs: Sequence[Mapping[str, Any]],
+        audits: Mapping[str, TimeAudit],
+        extra: Mapping[str, Any],
+    ) -> None:
+        """Write run.json: what was asked, what was read, and what this run counted, timed and warned of."""
+        write_run_json(
+            folder / "run.json",
+            command=request.command,
+            argv=request.argv,
+            config=request.config.model_dump(mode="json"),
+            inputs=inputs,
+            seed=request.seed,
+            started=self.started,
+            audits=audits,
+            warnings=self.warnings,
+            counts=self.counts,
+            stages=self.stages,
+            stopped_by=self.stopped_by,
+            extra=extra,
+        )
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:

@@ -11,7 +11,6 @@ from visfuse_cli.commands.fuse_cameras.scene import given_offsets, interval, ope
 from visfuse_cli.commands.fuse_cameras.video import annotate, drawn_tracks, plan_of
 from visfuse_cli.files.folders import paths_of
 from visfuse_cli.files.images import write_image
-from visfuse_cli.files.run_json import write_run_json
 from visfuse_cli.files.runfolder import RunFolder
 from visfuse_cli.files.spool import TrackSpool
 from visfuse_cli.files.video import describe
@@ -51,31 +50,14 @@ def run(request: RunRequest) -> RunResult:
         results.findings = tracker.audit.findings(eyes.zoom)
         for warning in complaints(scene.names, results.findings, interval(sources)):
             run_.warn(warning)
-        audits = {name: source.audit() for name, source in sources.items()}
-        for audit in audits.values():
-            for warning in audit.warnings:
-                run_.warn(warning)
+        audits = run_.audited(sources)
         for warning in shorter(audits):
             run_.warn(warning)
         write_image(folder / "map.png", plan_of(scene, results).whole(drawn_tracks(scene, config, spool, results)))
         if request.video and run_.stopped_by is None and all(each.video for each in scene.footage):
             annotate(scene, offsets, folder, request, run_, spool, results)
         summary = summary_of(scene, offsets, run_, results, folder)
-        write_run_json(
-            folder / "run.json",
-            command="fuse-cameras",
-            argv=request.argv,
-            config=config.model_dump(mode="json"),
-            inputs=inputs,
-            seed=request.seed,
-            started=run_.started,
-            audits=audits,
-            warnings=run_.warnings,
-            counts=run_.counts,
-            stages=run_.stages,
-            stopped_by=run_.stopped_by,
-            extra={"summary": summary},
-        )
+        run_.write_json(folder, request, inputs, audits, {"summary": summary})
     return RunResult(request.out, summary, run_.warnings, run_.stopped_by, run_.stages)
 
 

@@ -19,7 +19,6 @@ from visfuse_cli.files import homography as homography_files
 from visfuse_cli.files.atomic import replacing
 from visfuse_cli.files.folders import paths_of
 from visfuse_cli.files.lanes_file import read_lanes, write_lanes
-from visfuse_cli.files.run_json import write_run_json
 from visfuse_cli.files.runfolder import RunFolder
 from visfuse_cli.files.spool import TrackSpool, write_table
 from visfuse_cli.files.video import VideoSource, describe, is_clip_folder, list_clips, open_source
@@ -164,20 +163,12 @@ def _report(job: _Job, results: Findings, lanes: tuple[Polygon, ...], run_: Run,
     summary = summarised(
         ledger.speeds, len(ledger.rejected), job.config.display.units, run_.counts["frames"], results.audits, folder
     )
-    write_run_json(
-        folder / "run.json",
-        command="speed",
-        argv=request.argv,
-        config=job.config.model_dump(mode="json"),
-        inputs=job.inputs,
-        seed=request.seed,
-        started=run_.started,
-        audits=results.audits,
-        warnings=run_.warnings,
-        counts=run_.counts,
-        stages=run_.stages,
-        stopped_by=run_.stopped_by,
-        extra={
+    run_.write_json(
+        folder,
+        request,
+        job.inputs,
+        results.audits,
+        {
             "summary": summary,
             "began_utc": {name: utc(moment, 0.0) or None for name, moment in results.began.items()},
             "camera": {name: watch.report() for name, watch in results.watches.items()},

@@ -12,7 +12,6 @@ from visfuse_cli.commands.track_imm.scene import open_views
 from visfuse_cli.commands.track_imm.stereo import StereoRun
 from visfuse_cli.errors import InputError
 from visfuse_cli.files.folders import paths_of
-from visfuse_cli.files.run_json import write_run_json
 from visfuse_cli.files.runfolder import RunFolder
 from visfuse_cli.files.scene import check_scene, file
 from visfuse_cli.files.sensors import read_sensors
@@ -56,21 +55,7 @@ def run(request: RunRequest) -> RunResult:
         brief, own = head.extra()
         summary = {"targets": len(tracks), "tracks": tracks, "frames": run_.counts["frames"]} | brief
         summary |= {"units": request.config.display.units, "out": str(folder)}
-        write_run_json(
-            folder / "run.json",
-            command="track-imm",
-            argv=request.argv,
-            config=request.config.model_dump(mode="json"),
-            inputs=inputs,
-            seed=request.seed,
-            started=run_.started,
-            audits=audits,
-            warnings=run_.warnings,
-            counts=run_.counts,
-            stages=run_.stages,
-            stopped_by=run_.stopped_by,
-            extra={"summary": summary} | own,
-        )
+        run_.write_json(folder, request, inputs, audits, {"summary": summary} | own)
     return RunResult(request.out, summary, run_.warnings, run_.stopped_by, run_.stages)
 
 
@@ -87,9 +72,7 @@ def _head(request: RunRequest) -> StereoRun | PanTiltRun:
 
 
 def _audit(head: StereoRun | PanTiltRun, sources: dict[str, VideoSource], run_: Run) -> dict[str, Any]:
-    audits = {name: source.audit() for name, source in sources.items()}
-    for warning in (text for audit in audits.values() for text in audit.warnings):
-        run_.warn(warning)
+    audits = run_.audited(sources)
     doubt = head.audited({name: audit.frames for name, audit in audits.items()})
     if doubt is not None:
         run_.warn(doubt)

@@ -21,7 +21,6 @@ from visfuse_cli.facing.output import track_record
 from visfuse_cli.facing.rival import follow_triangulated
 from visfuse_cli.facing.settings import StereoConfig
 from visfuse_cli.files.folders import paths_of
-from visfuse_cli.files.run_json import write_run_json
 from visfuse_cli.files.runfolder import RunFolder
 from visfuse_cli.files.spool import TrackSpool
 from visfuse_cli.files.video import describe
@@ -58,9 +57,7 @@ def run(request: RunRequest) -> RunResult:
         for targets in follow(scene, sources, config, request, run_):
             with run_.stage("settle"):
                 _settle(targets, scene, spool, results, run_)
-        audits = {name: source.audit() for name, source in sources.items()}
-        for warning in (text for audit in audits.values() for text in audit.warnings):
-            run_.warn(warning)
+        audits = run_.audited(sources)
         lengths = {name: audit.frames for name, audit in audits.items()}
         if lengths["left"] != lengths["right"]:
             run_.warn(
@@ -78,21 +75,7 @@ def run(request: RunRequest) -> RunResult:
             "units": config.display.units,
             "out": str(folder),
         }
-        write_run_json(
-            folder / "run.json",
-            command="track-stereo-pf",
-            argv=request.argv,
-            config=config.model_dump(mode="json"),
-            inputs=inputs,
-            seed=request.seed,
-            started=run_.started,
-            audits=audits,
-            warnings=run_.warnings,
-            counts=run_.counts,
-            stages=run_.stages,
-            stopped_by=run_.stopped_by,
-            extra={"summary": summary},
-        )
+        run_.write_json(folder, request, inputs, audits, {"summary": summary})
     return RunResult(request.out, summary, run_.warnings, run_.stopped_by, run_.stages)
 
 
