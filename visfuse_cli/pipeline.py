@@ -25,6 +25,7 @@ from visfuse_cli.files.run_json import write_run_json
 from visfuse_cli.files.video import VideoSource
 from visfuse_cli.records import Frame, FrameSet, RunRequest, TimeAudit
 from visfuse_cli.threads import thread_cap
+from visfuse_cli.tracking.elsewhere import HandOver, at_once
 
 T = TypeVar("T")
 AHEAD = 3  # pictures that wait between two threads: enough to even out, too few to fill memory
@@ -277,17 +278,12 @@ def with_next(items: Iterator[T]) -> Iterator[tuple[T, T | None]]:
 
 
 @contextmanager
-def helper() -> Iterator[Callable[[Callable[[], T]], Callable[[], T]]]:
-    """A thread for one piece of work at a time: hand it over, call what comes back for the result.
+def helper() -> Iterator[HandOver]:
+    """A thread for pieces of work, one at a time: hand them over, call what comes back for the result.
 
     Where a run may use no other thread the work is done when it is handed over: the order is the same.
     """
     if thread_cap() == 1:
-
-        def at_once(work: Callable[[], T]) -> Callable[[], T]:
-            result = work()
-            return lambda: result
-
         yield at_once
         return
     with ThreadPoolExecutor(1, "visfuse-help") as pool:

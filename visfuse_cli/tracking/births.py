@@ -14,6 +14,7 @@ from visfuse_cli.tracking import dynamics as dynamics_tools
 from visfuse_cli.tracking import measure
 from visfuse_cli.tracking.association import claim, footprint_overlap, region_boxes
 from visfuse_cli.tracking.dynamics import Dynamics, Step
+from visfuse_cli.tracking.elsewhere import HandOver, at_once, nothing
 from visfuse_cli.tracking.evidence import Boxes, Evidence, LabelEvidence
 from visfuse_cli.tracking.hypotheses import HEADING_SIGMA, Guess, best_guess
 from visfuse_cli.tracking.joining import part_before
@@ -51,16 +52,21 @@ class Candidate:
 class Nursery:
     """Candidates, and the rule by which they become tracks."""
 
-    def __init__(self, camera: GroundCamera, settings: TrackerSettings, dynamics: Dynamics) -> None:
+    def __init__(
+        self, camera: GroundCamera, settings: TrackerSettings, dynamics: Dynamics, hand_over: HandOver = at_once
+    ) -> None:
         self._camera, self._settings, self._dynamics = camera, settings, dynamics
         self._candidates: list[Candidate] = []
-        self._points = MovingPoints(camera)
+        self._points, self._hand_over = MovingPoints(camera), hand_over
+        self._watched: Callable[[], None] = nothing  # the corners, which are being followed
 
     def watch(self, t: float, evidence: Evidence) -> None:
-        """Follow the corners of what moves; people turn and bend, so that theirs tell little."""
+        """Begin to follow the corners of what moves; people turn and bend, so that theirs tell little."""
         steers = self._settings.target.motion == "bicycle"
         if steers and isinstance(evidence, LabelEvidence) and (picture := evidence.picture()) is not None:
-            self._points.follow(picture, t, evidence.paint())
+            paint = evidence.paint()
+            self._watched()
+            self._watched = self._hand_over(lambda: self._points.follow(picture, t, paint))
 
     def feed(self, frame: int, t: float, regions: list[Region]) -> None:
         """Give the frame's unexplained regions to candidates, new ones where none fits."""
@@ -106,6 +112,7 @@ class Nursery:
         due = [c for c in self._candidates if c.missed_since is None and t >= c.scanned_again]
         if not due or not isinstance(evidence, LabelEvidence):
             return next_id
+        self._watched()
         courses = self._points.courses()
         for candidate in due:
             candidate.scanned_again = t + SCAN_S

@@ -12,6 +12,7 @@ from pydantic import Field
 from visfuse_cli.config import Section
 from visfuse_cli.maths.homography import apply
 from visfuse_cli.records import Array, Frame, GroundCamera, Image
+from visfuse_cli.tracking.elsewhere import HandOver, at_once, nothing
 from visfuse_cli.tracking.evidence import Boxes, BoxEvidence, Evidence, LabelEvidence
 from visfuse_cli.tracking.ground import GroundTracker
 from visfuse_cli.tracking.sun import Shade, Sun, shadow_picture
@@ -21,7 +22,6 @@ from visfuse_cli.vision.background import Background
 from visfuse_cli.vision.lens import distort_points
 from visfuse_cli.vision.steady import moved
 
-HandOver = Callable[[Callable[[], Image]], Callable[[], Image]]  # work to be done elsewhere -> its result, when called
 SETTLED = 12  # frames after which a track's size is known well enough to tell its shadow
 
 
@@ -42,12 +42,6 @@ class RegionSettings(Section):
 
     gap: float = Field(0.3, ge=0, le=5, description="m: gaps up to this size are closed")
     speck: float = Field(0.12, ge=0, le=5, description="m: specks below this size are removed")
-
-
-def at_once(work: Callable[[], Image]) -> Callable[[], Image]:
-    """Work that is done here and now."""
-    result = work()
-    return lambda: result
 
 
 class Detector(Protocol):
@@ -89,6 +83,7 @@ class MovingRegions:
         self._watched = None if region is None else region.picture(camera)
         self._sun, self._shade = Sun(camera), Shade(background.shadow_ratio)
         self._found: Callable[[], Image] | None = None  # what is being looked at ahead
+        self._learnt: Callable[[], None] = nothing  # what is being learnt
         self._raw = self._labels = np.zeros((0, 0), np.uint8)
 
     def foresee(self, frame: Frame) -> None:
@@ -104,6 +99,7 @@ class MovingRegions:
             labels = np.asarray(cv2.bitwise_and(labels, self._watched), dtype=np.uint8)
         if self._sun.shadow is not None and self._shade.needed and len(expected[0]):
             where = shadow_picture(self._camera, *expected, self._sun.shadow.per_metre)
+            self._learnt()
             labels = self._shade.cut(labels, frame.image, self._background.picture, where)
         self._labels = labels
         grey = np.asarray(cv2.cvtColor(frame.image, cv2.COLOR_BGR2GRAY), dtype=np.uint8)
@@ -117,11 +113,12 @@ class MovingRegions:
         lens = self._camera.ground.lens
         if lens is not None:
             followed = [distort_points(outline, lens) for outline in followed if len(outline)]
-        if self._found is not None:
-            self._found()  # the model must not change while it is looked at
-        self._background.learn(frame.image, frame.t, followed, self._raw)
+        raw = self._raw
+        self._learnt()
+        self._learnt = self._hand_over(lambda: self._background.learn(frame.image, frame.t, followed, raw))
 
     def report(self) -> dict[str, Any] | None:
+        self._learnt()
         return None if self._sun.shadow is None else self._sun.shadow.report()
 
 

@@ -19,6 +19,7 @@ from visfuse_cli.tracking import endings, measure
 from visfuse_cli.tracking.association import footprint_overlap
 from visfuse_cli.tracking.births import Nursery
 from visfuse_cli.tracking.dynamics import Dynamics, Prediction, Step
+from visfuse_cli.tracking.elsewhere import HandOver, at_once
 from visfuse_cli.tracking.endings import ONE_PLACE, trimmed
 from visfuse_cli.tracking.evidence import Boxes, Evidence
 from visfuse_cli.tracking.hypotheses import Guess, gain_of
@@ -48,14 +49,16 @@ class GroundTracker:
     Each frame: `predict(t)`, then `update(frame, evidence)`, which returns what ended.
     """
 
-    def __init__(self, camera: GroundCamera, settings: TrackerSettings, first_id: int = 1) -> None:
+    def __init__(
+        self, camera: GroundCamera, settings: TrackerSettings, first_id: int = 1, hand_over: HandOver = at_once
+    ) -> None:
         self.camera = camera
         self.settings = settings
         self.dynamics: Dynamics = dynamics_tools.for_target(settings.target, settings.filter)
         self.tracks: list[Track] = []
         self.unexplained: list[ImageRegion] = []  # what moved in the last frame and belongs to no track
         self.next_id = first_id
-        self._nursery = Nursery(camera, settings, self.dynamics)
+        self._nursery = Nursery(camera, settings, self.dynamics, hand_over)
         self._region = Region(np.array(settings.region)) if settings.region else None
         self._gate = gate_size(len(self.dynamics.H), settings.pose.gate)
         self._t = 0.0
@@ -77,11 +80,11 @@ class GroundTracker:
 
     def update(self, frame: int, evidence: Evidence) -> tuple[list[Track], list[Abandoned]]:
         """Measure every track, and let the rest become tracks; returns the tracks and candidates that ended."""
+        self._nursery.watch(self._t, evidence)
         if self.tracks:
             self._measure(frame, evidence)
         self._remember(frame, evidence)
         self._reconsider(evidence)
-        self._nursery.watch(self._t, evidence)
         self.unexplained = evidence.leftovers(*self.boxes())
         self._nursery.feed(frame, self._t, self.unexplained)
         self.next_id = self._nursery.born(self.next_id, self.tracks, self._held, self._recent, self._boxes_at)

@@ -14,7 +14,8 @@ from visfuse_cli.files.video import VideoSource
 from visfuse_cli.pipeline import Run, helper, with_next
 from visfuse_cli.records import Array, Frame, GroundCamera, Image, TimeAudit
 from visfuse_cli.tracking.camera_watch import CameraWatch
-from visfuse_cli.tracking.foreground import Detections, Detector, HandOver, MovingRegions
+from visfuse_cli.tracking.elsewhere import HandOver
+from visfuse_cli.tracking.foreground import Detections, Detector, MovingRegions
 from visfuse_cli.tracking.ground import GroundTracker
 from visfuse_cli.tracking.headlights import Headlights
 from visfuse_cli.tracking.ledger import Ledger, Recording
@@ -55,7 +56,6 @@ class Clip:
 
 def follow(clip: Clip, run_: Run, spool: TrackSpool, findings: Findings, first_id: int, label: str | None) -> int:
     """Follow everything in one clip; returns the next free id."""
-    tracker = GroundTracker(clip.camera, clip.config, first_id)
     findings.ledger.drawn[clip.name] = []
     strangers = findings.strangers[clip.name] = Strangers(clip.camera)
     with helper() as hand_over:
@@ -64,6 +64,7 @@ def follow(clip: Clip, run_: Run, spool: TrackSpool, findings: Findings, first_i
             empty = empty_picture(pictures, min(STEADIED_PX, shake))
             watch = findings.watches[clip.name] = CameraWatch(empty)
             look, lamps = _detector(clip, empty, hand_over), Headlights(empty, clip.camera)
+        tracker = GroundTracker(clip.camera, clip.config, first_id, hand_over)
         of = Recording(clip.name, label, clip.camera, findings.began[clip.name], watch.image_from_rest)
         for frame, following in with_next(_steadied(clip.source, watch, run_)):
             tracker.predict(frame.t)
