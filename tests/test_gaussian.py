@@ -29,6 +29,16 @@ def test_update_equals_conditioning_of_the_joint_gaussian():
     assert innovation.nis == pytest.approx((z - H @ m) @ np.linalg.inv(S) @ (z - H @ m), rel=1e-12)
 
 
+def test_a_measurement_of_all_but_unknown_states_leaves_its_own_noise():
+    # 1e14 times less than was there before: what is left of the prior by subtraction alone is rounding.
+    rng = np.random.default_rng(9)
+    for _ in range(20):
+        R = 1e-2 * covariance(rng, 2)
+        after, _ = gaussian.update(Gaussian(np.zeros(4), 1e12 * np.eye(4)), rng.normal(size=2), H, R)
+        np.testing.assert_allclose(after.cov[:2, :2], R, rtol=1e-6)
+        assert np.linalg.eigvalsh(after.cov).min() > 0
+
+
 def test_filter_over_many_steps_equals_one_joint_gaussian():
     rng = np.random.default_rng(2)
     steps, q = 6, 0.7

@@ -12,6 +12,7 @@ from visfuse_cli.maths.angles import wrap_at
 from visfuse_cli.records import Array, Gaussian, Innovation
 
 HALF_LOG_TAU = 0.5 * np.log(2 * np.pi)
+AMPLE = 1e200  # above any squared residual in units of its deviation, and any inverse variance
 
 
 def transpose(matrix: NDArray[Any]) -> Array:
@@ -45,26 +46,17 @@ def predict(belief: Gaussian, F: Array, Q: Array) -> Gaussian:
 
 
 def propagate(cov: Array, F: Array, Q: Array) -> Array:
-    """Covariance (..., n, n) one step ahead: F P F^T + Q. Lou 2002, eq. 8."""
-    return symmetrise(F @ cov @ transpose(F) + Q)
+    """Covariance (..., n, n) one step ahead: F P F^T + Q, symmetric but for rounding. Lou 2002, eq. 8."""
+    return np.asarray(F @ cov @ transpose(F) + Q)
 
 
-def innovate(belief: Gaussian, residual: Array, H: Array, R: Array) -> tuple[Innovation, Array]:
-    """What a measurement says about a belief (..., n), and the gain (..., n, m). Lou 2002, eq. 7.
+def innovate(belief: Gaussian, residual: Array, H: Array, R: Array) -> Innovation:
+    """What a measurement says about a belief (..., n). Lou 2002, eq. 7.
 
     residual (..., m) is z - h(x), its angles wrapped by the caller; H (..., m, n); R (..., m, m).
     Raises LinAlgError where H P H^T + R is not positive definite.
     """
-    H_P = H @ belief.cov
-    S = H_P @ transpose(H) + R
-    if residual.shape != H_P.shape[:-1]:
-        shape = np.broadcast_shapes(residual.shape, H_P.shape[:-1])
-        residual, H_P = np.broadcast_to(residual, shape), np.broadcast_to(H_P, (*shape, H_P.shape[-1]))
-    solved = np.linalg.solve(S, np.concatenate([H_P, residual[..., None]], axis=-1))
-    gain = transpose(solved[..., :-1])
-    nis = np.add.reduce(residual * solved[..., -1], axis=-1)
-    log_likelihood = -0.5 * nis - _log_normaliser(np.linalg.cholesky(S))
-    return Innovation(residual, S, nis, log_likelihood), gain
+    return _weighed(belief.cov, residual, H, R)[0]
 
 
 def update(belief: Gaussian, residual: Array, H: Array, R: Array) -> tuple[Gaussian, Innovation]:
@@ -72,23 +64,49 @@ def update(belief: Gaussian, residual: Array, H: Array, R: Array) -> tuple[Gauss
 
     Raises LinAlgError where H P H^T + R is not positive definite.
     """
-    innovation, gain = innovate(belief, residual, H, R)
-    return correct(belief, innovation.residual, H, R, gain), innovation
+    innovation, P_H, K = _weighed(belief.cov, residual, H, R)
+    # (I - K H) P (I - K H)^T + K R K^T, grouped as Bierman 1977 does: no matrix product of full size is left, and what
+    # rounding leaves of a vague prior in M is still taken out by the second factor.
+    M = belief.cov - K @ transpose(P_H)
+    left = by_one(K, R)
+    left -= by_one(M, transpose(H))
+    M += left @ transpose(K)
+    return Gaussian(belief.mean + times(K, innovation.residual), symmetrise(M)), innovation
+
+
+def _weighed(P: Array, residual: Array, H: Array, R: Array) -> tuple[Innovation, Array, Array]:
+    """A measurement against a belief's covariance: the innovation, P H^T and the gain (..., n, m)."""
+    P_H = by_one(P, transpose(H))
+    S = H @ P_H + R
+    m = S.shape[-1]
+    if residual.shape != S.shape[:-1]:
+        residual = np.broadcast_to(residual, np.broadcast_shapes(residual.shape, S.shape[:-1]))
+    # One factorisation does it all: below the factor L of S, that of [[S, .], [B, c I]] holds B L^-T.
+    joint = np.empty((*residual.shape[:-1], 2 * m + 1, 2 * m + 1))
+    joint[...] = _border(m)
+    joint[..., :m, :m] = S
+    joint[..., -1, :m] = residual
+    factor = np.linalg.cholesky(joint)
+    L_inv_T, whitened = factor[..., m:-1, :m], factor[..., -1, :m]
+    nis = np.add.reduce(whitened * whitened, axis=-1)
+    log_likelihood = -0.5 * nis - _log_normaliser(factor[..., :m, :m])
+    return Innovation(residual, S, nis, log_likelihood), P_H, P_H @ L_inv_T @ transpose(L_inv_T)
 
 
 @cache
-def _identity(size: int) -> Array:
-    eye = np.eye(size)
-    eye.flags.writeable = False
-    return eye
+def _border(m: int) -> Array:
+    """What surrounds a covariance (m, m) to be factorised: below it the identity and one row to be whitened."""
+    frame = AMPLE * np.eye(2 * m + 1)
+    frame[m:-1, :m] = np.eye(m)
+    frame.flags.writeable = False
+    return frame
 
 
-def correct(belief: Gaussian, residual: Array, H: Array, R: Array, gain: Array) -> Gaussian:
-    """Belief (..., n) after a measurement taken in with any gain (..., n, m), optimal or not (Joseph form)."""
-    keep = _identity(belief.mean.shape[-1]) - gain @ H
-    cov = keep @ belief.cov @ transpose(keep)
-    cov += gain @ R @ transpose(gain)
-    return Gaussian(belief.mean + times(gain, residual), symmetrise(cov))
+def by_one(stack: Array, matrix: Array) -> Array:
+    """Matrices (..., k, n) times one (n, m) for all of them, as one product, or times (..., n, m), each by its own."""
+    if matrix.ndim > 2:
+        return stack @ matrix
+    return np.dot(stack.reshape(-1, stack.shape[-1]), matrix).reshape(*stack.shape[:-1], matrix.shape[-1])
 
 
 def log_density(residual: Array, cov: Array) -> Array:

@@ -101,8 +101,9 @@ def mix(bank: Bank, log_p: Array, angles: tuple[int, ...] = ()) -> tuple[Gaussia
     `angles` are components of the state on the circle. Bradshaw 1997, sec. 5.
     """
     p, mu = np.exp(log_p), np.exp(bank.log_mu)
-    c = np.maximum(mu @ p, LEAST_LIKELY)  # c_j = sum_i p_ij mu_i: Jia 2008, eq. 23
-    share = p.T * mu[..., None, :] / c[..., None]  # mu_i|j, j first: Jia 2008, eq. 24
+    c = np.maximum(np.dot(mu, p), LEAST_LIKELY)  # c_j = sum_i p_ij mu_i: Jia 2008, eq. 23
+    share = p.T * mu[..., None, :]
+    share /= c[..., None]  # mu_i|j, j first: Jia 2008, eq. 24
     return _matched(bank.beliefs, share, angles), np.log(c)
 
 
@@ -143,8 +144,9 @@ def update(step: Step, residual: Array, H: Array, R: Array) -> tuple[Step, Innov
 
 def weigh(ahead: Array, log_likelihood: Array) -> Array:
     """The models' log probabilities (..., r) after a measurement. Jia 2008, eqs. 28-29, the sum over j."""
-    total = ahead + log_likelihood
-    return np.asarray(total - _log_sum(total, axis=-1)[..., None])
+    log_mu = ahead + log_likelihood
+    log_mu -= _log_sum(log_mu, axis=-1)[..., None]
+    return log_mu
 
 
 def combined(bank: Bank, angles: tuple[int, ...] = ()) -> Gaussian:

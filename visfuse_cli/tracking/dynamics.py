@@ -240,7 +240,7 @@ def take(dynamics: Dynamics, prediction: Prediction, z: Array, R: Array) -> Step
     if prediction.models is not None:
         each = residual(dynamics, z, prediction.models.predicted.mean)
         models, _ = imm.update(prediction.models, each, dynamics.H, R)
-        innovation, _ = gaussian.innovate(prediction.prior, gamma, dynamics.H, R)
+        innovation = gaussian.innovate(prediction.prior, gamma, dynamics.H, R)
         posterior = imm.combined(models.filtered, dynamics.angles_x)
         return Step(prediction.prior, posterior, prediction.F, innovation, None, models)
     memory = prediction.memory or fading.start(prediction.prior, dynamics.H, R)
