@@ -23,7 +23,7 @@ from visfuse_cli.vision.wireframe import DIRECTIONS, EDGES, Outlines, corners, s
 
 STEPS = 12  # places either side of the expected edge
 SURE = 4  # places either side of the found one that must agree
-UNKNOWN = 0  # evidence where another vehicle or the frame's border is in the way
+NOWHERE = -128  # fewer votes than any border has
 CLEAR_PX = 2.5  # between a border and the background outside it
 SOLID = 0.8  # of what lies inside a border must be paint to take what lies outside for shadow
 GROUND_EDGES = 4  # the first of the EDGES lie on the ground
@@ -101,22 +101,25 @@ def search(
     count = len(pose)
     middle, at, normal, edge, share, total = _places(camera, pose, size)
     offset = reach[:, None] * np.linspace(-1, 1, 2 * STEPS + 1)  # (N, S)
-    along = at[:, :, None] + normal[:, :, None] * offset[:, None, :, None]  # (N, K, S, 2)
+    along = at[..., None] + normal[..., None] * offset[:, None]  # (2, N, K, S)
     label, whose, inside = _look(sights, camera, along)
     known = inside & ((whose == 0) | (whose == code[:, None, None]))
-    found = np.full((2, *share.shape), np.nan)
-    for k, moved in enumerate((label == FOREGROUND, label > 0)):  # shadow is outside, or it is grey paint
-        found[k] = _border(np.where(known, 2 * moved - 1, UNKNOWN), offset)
+    paint = known & (label == FOREGROUND)
+    # shadow is outside, or it is grey paint
+    found = np.stack([_border(known, moved, offset) for moved in (paint, known & (label > 0))])
     nearest = np.where(np.abs(found[1]) < np.abs(np.nan_to_num(found[0], nan=np.inf)), found[1], found[0])
     ground = edge < GROUND_EDGES
-    under = _stands_in_shadow(label, known, offset, found, ground)
+    under = _stands_in_shadow(paint, known, offset, found, ground)
     nearest = np.where(under, found[0], nearest)
     valid = np.isfinite(nearest)
-    support = np.sum(normal * at, axis=-1) + np.nan_to_num(nearest)
-    outlines = Outlines(normal, support, EDGES[edge], share, valid, np.zeros(count, dtype=bool), total / np.pi)
+    support = _dot(normal, at) + np.nan_to_num(nearest)
+    rows = np.ascontiguousarray(np.moveaxis(normal, 0, -1))
+    outlines = Outlines(rows, support, EDGES[edge], share, valid, np.zeros(count, dtype=bool), total / np.pi)
 
-    in_view = known.mean(axis=2) > OPEN
-    told = in_view & (valid | ~_amidst(label, known))
+    seen = np.count_nonzero(known, axis=2)
+    in_view = seen / known.shape[2] > OPEN
+    amidst = np.count_nonzero(paint, axis=2) > SOLID * seen  # nothing but paint: another vehicle is beside this one
+    told = in_view & (valid | ~amidst)
     label, whose, inside = _look(sights, camera, _spokes(middle, at, _RADII))
     own = inside & (whose == code[:, None, None])
     area = _areas(middle, at, normal)[..., None] * np.ones(len(_RADII))
@@ -149,13 +152,13 @@ class Fill:
 def fill(sight: Sight, camera: GroundCamera, pose: Array, size: Array) -> Fill:
     """What N boxes with pose (N, 3) and size (N, 3) are filled with, among the owners there."""
     middle, at, normal, _, _, total = _places(camera, pose, size)
-    label, whose, inside = _look([sight], camera, _spokes(middle, at[:, ::2], _RADII[1::2]))
+    label, whose, inside = _look([sight], camera, _spokes(middle, at[:, :, ::2], _RADII[1::2]))
     free = inside & (whose == 0)
     area = _areas(middle, at, normal)
     weight = area[:, ::2, None] * free
     whole = np.maximum(weight.sum(axis=(1, 2)), 1e-9)
     off = np.clip(OUTSIDE * total / np.pi, *OUTSIDE_PX)
-    around, whose, inside = _look([sight], camera, at + off[:, None, None] * normal)
+    around, whose, inside = _look([sight], camera, at + off[:, None] * normal)
     told = inside & (whose == 0)
     # half of what a place's border length times its distance from the middle sums up to
     return Fill(
@@ -170,57 +173,61 @@ def fill(sight: Sight, camera: GroundCamera, pose: Array, size: Array) -> Fill:
 def _places(
     camera: GroundCamera, pose: Array, size: Array
 ) -> tuple[Array, Array, Array, NDArray[np.intp], Array, Array]:
-    """Middle (N, 1, 2) px of each silhouette, and K places spread evenly along its border.
+    """Middle (2, N, 1) px of each silhouette, and K places spread evenly along its border.
 
-    at (N, K, 2) px and outward normal (N, K, 2) of the places, which of the EDGES (N, K) each lies on and how far along
-    it (N, K), and the border's length (N,) px.
+    at (2, N, K) px and outward normal (2, N, K) of the places, which of the EDGES (N, K) each lies on and how far along
+    it (N, K), and the border's length (N,) px. Coordinates come first: numpy is slow along short last axes.
     """
     pixels, _ = project(camera, corners(pose, size))
-    pixels = np.nan_to_num(pixels, nan=-1e4)
-    ends = pixels[:, EDGES]  # (N, 12, 2, 2)
-    length = np.linalg.norm(ends[:, :, 1] - ends[:, :, 0], axis=2) * silhouette_edges(camera, pose, size)
+    pixels = np.nan_to_num(np.moveaxis(pixels, -1, 0), nan=-1e4)  # (2, N, 8)
+    first, last = pixels[..., EDGES[:, 0]], pixels[..., EDGES[:, 1]]  # (2, N, 12)
+    length = _length(last - first) * silhouette_edges(camera, pose, size)
     total = np.cumsum(length, axis=1)
     places = (np.arange(DIRECTIONS) + 0.5) / DIRECTIONS * total[:, -1:]
-    edge = np.minimum(np.sum(places[:, :, None] > total[:, None], axis=2), len(EDGES) - 1)  # (N, K)
+    edge = np.minimum(np.count_nonzero(places[:, :, None] > total[:, None], axis=2), len(EDGES) - 1)  # (N, K)
     rows = np.arange(len(pose))[:, None]
     share = (places - total[rows, edge]) / np.maximum(length[rows, edge], 1e-9) + 1
     share = np.clip(share, 0, 1)
-    a, b = ends[rows, edge, 0], ends[rows, edge, 1]
-    at = a + share[..., None] * (b - a)
-    normal = np.stack([b[..., 1] - a[..., 1], a[..., 0] - b[..., 0]], axis=-1)
-    normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-9)
-    middle = pixels.mean(axis=1)[:, None]
-    inward = np.sum(normal * (at - middle), axis=-1) < 0
-    normal[inward] *= -1
+    a, b = first[:, rows, edge], last[:, rows, edge]
+    at = a + share * (b - a)
+    normal = np.stack([b[1] - a[1], a[0] - b[0]])
+    normal /= np.maximum(_length(normal), 1e-9)
+    middle = pixels.mean(axis=2)[..., None]
+    normal *= np.where(_dot(normal, at - middle) < 0, -1.0, 1.0)
     return middle, at, normal, edge, share, total[:, -1]
 
 
+def _dot(a: Array, b: Array) -> Array:
+    """Products (...) of plane vectors (2, ...)."""
+    return a[0] * b[0] + a[1] * b[1]
+
+
+def _length(a: Array) -> Array:
+    """Lengths (...) of plane vectors (2, ...)."""
+    return np.sqrt(_dot(a, a))
+
+
 def _spokes(middle: Array, at: Array, radii: Array) -> Array:
-    """Points (N, K, R, 2) px between the middle (0) and the border (1)."""
-    return middle[..., None, :] + radii[:, None] * (at - middle)[:, :, None]
+    """Points (2, N, K, R) px between the middle (0) and the border (1)."""
+    return middle[..., None] + radii * (at - middle)[..., None]
 
 
 def _areas(middle: Array, at: Array, normal: Array) -> Array:
     """Distance (N, K) px from the middle to each place's edge: its share of the area."""
-    return np.abs(np.sum(normal * (at - middle), axis=-1))
+    return np.abs(_dot(normal, at - middle))
 
 
 def _stands_in_shadow(
-    label: np.ndarray, known: np.ndarray, offset: Array, found: Array, ground: NDArray[np.bool_]
+    paint: np.ndarray, known: np.ndarray, offset: Array, found: Array, ground: NDArray[np.bool_]
 ) -> NDArray[np.bool_]:
     """Which rows (N, K) on `ground` edges end in the shadow a vehicle stands in: above it there is solid paint.
 
     A grey vehicle looks like shadow too, but then its paint is no more than its windows, lamps and wheels.
     """
     both = ground & (found[1] - found[0] > CLEAR_PX)
-    inside = known & both[..., None] & (offset[:, None] < np.nan_to_num(found[0])[..., None])
-    solid = np.sum(inside & (label == FOREGROUND), axis=(1, 2)) > SOLID * np.sum(inside, axis=(1, 2))
+    inside = both[..., None] & (offset[:, None] < np.nan_to_num(found[0])[..., None])
+    solid = np.count_nonzero(inside & paint, axis=(1, 2)) > SOLID * np.count_nonzero(inside & known, axis=(1, 2))
     return np.asarray(both & solid[:, None])
-
-
-def _amidst(label: np.ndarray, known: np.ndarray) -> NDArray[np.bool_]:
-    """Which profiles (N, K) show nothing but paint: another vehicle is beside this one."""
-    return np.asarray(np.sum(known & (label == FOREGROUND), axis=2) > SOLID * np.sum(known, axis=2))
 
 
 def _share(part: np.ndarray, whole: np.ndarray, weight: Array | float) -> Array:
@@ -231,30 +238,37 @@ def _share(part: np.ndarray, whole: np.ndarray, weight: Array | float) -> Array:
 
 
 def _look(sights: Sequence[Sight], camera: GroundCamera, points: Array) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Labels, owners and whether they lie in the picture, at points (N, ..., 2) px of one sight or of N."""
+    """Labels, owners and whether they lie in the picture, at points (2, N, ...) px of one sight or of N.
+
+    What labels and owners are told outside of the picture means nothing.
+    """
     if camera.ground.lens is not None:
-        points = distort_points(points.reshape(-1, 2), camera.ground.lens).reshape(points.shape)
+        points = distort_points(points.reshape(2, -1).T, camera.ground.lens).T.reshape(points.shape)
     height, width = sights[0].owner.shape
-    whole = np.round(np.clip(points, -2, 1e5)).astype(int)
-    u, v = np.clip(whole[..., 0], 0, width - 1), np.clip(whole[..., 1], 0, height - 1)
-    inside = (whole[..., 0] > 0) & (whole[..., 0] < width - 1) & (whole[..., 1] > 0) & (whole[..., 1] < height - 1)
+    u, v = np.rint(np.clip(points, -2, 1e5)).astype(np.intp)
+    inside = (u > 0) & (u < width - 1) & (v > 0) & (v < height - 1)
     if len(sights) == 1:
-        return sights[0].labels.at(v, u), sights[0].owner[v, u], inside
+        return sights[0].labels.at(v, u), sights[0].owner.take(v * width + u, mode="clip"), inside
     label = np.stack([sight.labels.at(v[k], u[k]) for k, sight in enumerate(sights)])
-    return label, np.stack([sight.owner[v[k], u[k]] for k, sight in enumerate(sights)]), inside
+    whose = np.stack([sight.owner.take(v[k] * width + u[k], mode="clip") for k, sight in enumerate(sights)])
+    return label, whose, inside
 
 
-def _border(evidence: np.ndarray, offset: Array) -> Array:
-    """Where (N, K) px, along profiles (N, K, S) of +1 inside, -1 outside, 0 unknown, the border lies; NaN: nowhere."""
-    total = np.cumsum(evidence, axis=2)
+def _border(known: np.ndarray, moved: np.ndarray, offset: Array) -> Array:
+    """Where (N, K) px, along profiles (N, K, S) that are `known` and, of these, `moved`, the border lies; NaN: nowhere.
+
+    Each place votes +1 for inside where it moved, -1 for outside, and not at all where it is not known.
+    """
+    votes = 2 * moved.view(np.int8) - known.view(np.int8)
+    total = np.cumsum(votes, axis=2, dtype=np.int8)  # of fewer than 2 * STEPS + 2 places
     before = total[:, :, SURE - 1 :].copy()
     before[:, :, 1:] -= total[:, :, :-SURE]  # sums of SURE places that end here
     first, last = SURE - 1, total.shape[2] - SURE - 1  # a border lies after place c, first <= c <= last
     inner = before[:, :, : last - first + 1]
     outer = before[:, :, SURE : SURE + last - first + 1]
     sure = (inner >= SURE // 2) & (outer <= -SURE // 2)
-    split = np.where(sure, 2 * total[:, :, first : last + 1] - total[:, :, -1:], -np.inf)
+    split = np.where(sure, 2 * total[:, :, first : last + 1] - total[:, :, -1:], np.int8(NOWHERE))
     best = np.argmax(split, axis=2)
-    found = np.take_along_axis(split, best[..., None], axis=2)[..., 0] > -np.inf
+    found = np.take_along_axis(split, best[..., None], axis=2)[..., 0] > NOWHERE
     middle = (offset[:, first : last + 1] + offset[:, first + 1 : last + 2]) / 2
     return np.where(found, np.take_along_axis(middle, best, axis=1), np.nan)

@@ -30,11 +30,12 @@ class Labels:
         return _labelled(*(np.unpackbits(bits, axis=1, count=self._width) for bits in self._bits))
 
     def at(self, v: NDArray[np.intp], u: NDArray[np.intp]) -> NDArray[np.uint8]:
-        """The labels (...) at rows v and columns u (...) inside the picture."""
+        """The labels (...) at rows v and columns u (...) of the picture; outside of it anything."""
         if self._picture is not None:
-            return np.asarray(self._picture[v, u])
-        place, shift = u >> 3, (7 - (u & 7)).astype(np.uint8)
-        return _labelled(*((bits[v, place] >> shift) & 1 for bits in self._bits))
+            return np.asarray(self._picture.take(v * self._width + u, mode="clip"))
+        shift = (~u & 7).astype(np.uint8)
+        place = v * self._bits[0].shape[1] + (u >> 3)
+        return _labelled(*((bits.take(place, mode="clip") >> shift) & 1 for bits in self._bits))
 
 
 def _labelled(moved: NDArray[np.uint8], paint: NDArray[np.uint8]) -> NDArray[np.uint8]:
