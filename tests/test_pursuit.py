@@ -8,6 +8,8 @@ import pytest
 
 from samples.head import room
 from visfuse_cli.gazing import conclude, find
+from visfuse_cli.gazing.target import BELIEVED, SEEN
+from visfuse_cli.maths.kept import Rows
 from visfuse_cli.moving.pursuit import Pursuit
 from visfuse_cli.moving.settings import ImmConfig
 from visfuse_cli.moving.tracker import TWINS_S, Tracker
@@ -146,12 +148,14 @@ def test_a_gaze_that_passes_the_half_turn_is_predicted_as_any_other():
     later = places + 0.2 * np.array([1.5, 0.0])
     target = SimpleNamespace(
         config=SimpleNamespace(latency=0.2),
-        looks=[SimpleNamespace(t=now, z=np.array([*place, 1.5, 0.0])) for now, place in zip(t, places, strict=True)],
-        steps=list(t),
-        ahead=[SimpleNamespace(mean=place) for place in later],
+        seen=Rows(SEEN),
+        believed=Rows(BELIEVED),
         head=SimpleNamespace(centre=np.array([0.0, 0.0, 4.0])),
         height=0.9,
     )
+    for k, now in enumerate(t):
+        target.seen.append(k, now, np.zeros(4), [*places[k], 1.5, 0.0])
+        target.believed.append(np.nan, later[k])
     plane, ground = conclude.prediction_errors(target)
     assert ground < 1e-5
     assert ground < plane < 5e-3

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
@@ -16,6 +16,7 @@ from visfuse_cli.files.runfolder import TRACKS_PARTIAL
 SCHEMA = "visfuse.tracks/1"
 DIGITS = 12  # significant; a UTM northing keeps its tenth of a millimetre
 COVARIANCE_DIGITS = 9
+PIECE = 1 << 20  # bytes that are copied at once
 
 
 class TrackSpool:
@@ -52,25 +53,34 @@ class TrackSpool:
         return len(self._index)
 
     def add(self, track: Mapping[str, Any]) -> None:
-        """Keep one finished track; raises ValueError on a number that is not finite or an id seen before."""
+        """Keep one finished track; its `states` may be any iterable, and are taken one by one.
+
+        Raises ValueError on a number that is not finite or an id seen before.
+        """
         identity = int(track["id"])
         if identity in self._index:
             raise ValueError(f"two tracks have the id {identity}")
-        line = json.dumps(_rounded(track, DIGITS), allow_nan=False, separators=(",", ":")).encode()
         with failing_as_output(self._partial):
-            self._file.write(line + b"\n")
+            self._file.seek(self._end)
+            self._file.writelines(_pieces(track))
             self._file.flush()
-        self._index[identity] = (self._end, len(line))
-        self._end += len(line) + 1
+        end = self._file.tell()
+        self._index[identity] = (self._end, end - self._end)
+        self._end = end
 
     def read(self, identity: int) -> dict[str, Any]:
-        """One track as it was added."""
-        offset, length = self._index[identity]
-        self._file.seek(offset)
-        line = self._file.read(length)
-        self._file.seek(self._end)
-        track: dict[str, Any] = json.loads(line)
+        """One track as it was added, but for its covariances."""
+        track: dict[str, Any] = json.loads(b"".join(self._copied(identity)), object_hook=without_covariance)
         return track
+
+    def _copied(self, identity: int) -> Iterator[bytes]:
+        """The text of one track, piece by piece."""
+        offset, left = self._index[identity]
+        self._file.seek(offset)
+        while left:
+            piece = self._file.read(min(left, PIECE))
+            left -= len(piece)
+            yield piece
 
     def finish(self) -> None:
         """Write tracks.json from what was added so far, sorted by id."""
@@ -78,11 +88,9 @@ class TrackSpool:
         with replacing(self.path) as file:
             file.write(head + b', "tracks": [')
             for number, identity in enumerate(sorted(self._index)):
-                offset, length = self._index[identity]
-                self._file.seek(offset)
-                file.write((b",\n" if number else b"\n") + self._file.read(length))
+                file.write(b",\n" if number else b"\n")
+                file.writelines(self._copied(identity))
             file.write(b"\n]}\n")
-        self._file.seek(self._end)
 
 
 def write_table(path: str | Path, columns: Sequence[str], rows: Iterable[Mapping[str, Any]]) -> None:
@@ -104,6 +112,24 @@ def _table_order(row: Mapping[str, Any]) -> tuple[str, float, float]:
         float("-inf") if start in unknown else float(start),
         float("inf") if identity in unknown else float(identity),
     )
+
+
+def without_covariance(entry: dict[str, Any]) -> dict[str, Any]:
+    """The hook for JSON objects that leaves out the largest part of a state, which nobody draws."""
+    entry.pop("covariance", None)
+    return entry
+
+
+def _pieces(track: Mapping[str, Any]) -> Iterator[bytes]:
+    """The JSON text of one track, state by state; `states` come last."""
+    yield _text({key: value for key, value in track.items() if key != "states"})[:-1] + b',"states":['
+    for number, state in enumerate(track.get("states", ())):
+        yield (b"," if number else b"") + _text(state)
+    yield b"]}"
+
+
+def _text(value: Any) -> bytes:
+    return json.dumps(_rounded(value, DIGITS), allow_nan=False, separators=(",", ":")).encode()
 
 
 def _rounded(value: Any, digits: int) -> Any:

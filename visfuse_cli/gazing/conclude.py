@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from visfuse_cli.gazing.head import ground_shift
-from visfuse_cli.gazing.target import Look, Target, belief
+from visfuse_cli.gazing.target import Target, belief
 from visfuse_cli.maths import gaussian, motion
 from visfuse_cli.maths.angles import wrap
+from visfuse_cli.maths.gaussian import symmetrise, transpose
 from visfuse_cli.records import Array, Gaussian, GroundMap
 
 Z95 = 1.959963984540054
@@ -21,13 +24,13 @@ SLOWEST = 0.12  # m/s
 
 @dataclass(frozen=True, slots=True)
 class _Part:
-    """What was seen of a target without a break: looks, beliefs mean (T, 4) and cov (T, 4, 4), log mu, predictions."""
+    """What was seen of a target without a break, rows of `SEEN` and `BELIEVED`; beliefs mean (T, 4), cov (T, 4, 4)."""
 
-    looks: list[Look]
+    seen: NDArray[np.void]
+    believed: NDArray[np.void]
     mean: Array
     cov: Array
     log_mu: Array
-    ahead: list[Gaussian | None]
 
 
 def conclude(target: Target, ground: GroundMap) -> dict[str, Any] | None:
@@ -36,48 +39,44 @@ def conclude(target: Target, ground: GroundMap) -> dict[str, Any] | None:
     while (earlier := chain[-1].earlier) is not None:
         chain.append(earlier)
     parts = [part for each in chain[::-1] if (part := _part(each, ground)) is not None]
-    looks = [look for part in parts for look in part.looks]
-    seen = np.array([look.z is not None for look in looks])
     life = target.config.life
-    if np.count_nonzero(seen) < life.min_frames:
+    if not parts or sum(np.count_nonzero(_measured(part.seen)) for part in parts) < life.min_frames:
         return None
-    mean, cov, log_mu = (np.concatenate([getattr(part, name) for part in parts]) for name in ("mean", "cov", "log_mu"))
-    ahead = [each for part in parts for each in part.ahead]
-    t = np.array([look.t for look in looks])
-    duration = float(t[-1] - t[0])
-    distance = float(np.sum(np.hypot(*np.diff(mean[:, :2], axis=0).T)))
-    off = np.hypot(*(mean[:, :2] - mean[0, :2]).T)
+    whole = _Part(*(np.concatenate([getattr(part, each.name) for part in parts]) for each in fields(_Part)))
+    off = np.hypot(*(whole.mean[:, :2] - whole.mean[0, :2]).T)
     far = int(np.argmax(off))  # it may come back
+    t = whole.seen["t"]
     if not target.given and (off[far] < life.min_moved or off[far] < SLOWEST * (t[far] - t[0])):
         return None
-    names = target.models.names
-    return {
-        "id": target.id,
-        "summary": _summary(target, t, seen, distance, duration, cov),
-        "states": [
-            _state(target, looks[k], ahead[k], mean[k], cov[k], dict(zip(names, np.exp(log_mu[k]), strict=True)))
-            for k in range(len(looks))
-        ],
-    }
+    return {"id": target.id, "summary": _summary(target, whole), "states": _states(target, whole)}
+
+
+def _measured(seen: NDArray[np.void]) -> NDArray[np.bool_]:
+    return np.isfinite(seen["z"][:, 0])
 
 
 def _part(target: Target, ground: GroundMap) -> _Part | None:
     """What was seen of a target without a break, up to its last measurement; None where that is next to nothing."""
-    measured = [k for k, look in enumerate(target.looks) if look.z is not None]
-    if not target.steps or len(measured) < 2:
+    seen, banks = target.seen[:], target.banks
+    measured = np.flatnonzero(_measured(seen))
+    if banks is None or len(measured) < 2:
         return None
-    last = measured[-1] + 1
-    steps = target.steps[:last]
-    t = np.array([look.t for look in target.looks[:last]])
-    banks = target.models.smoothed(steps, t) if target.config.smooth else [step.filtered for step in steps]
-    beliefs = [belief(bank) for bank in banks]
-    mean, cov = np.stack([b.mean for b in beliefs]), np.stack([b.cov for b in beliefs])
+    seen = seen[: measured[-1] + 1]
+    count = len(seen)
+    told = target.models.smoothed(banks, seen["t"]) if target.config.smooth else banks.backward(count)
+    mean, cov, log_mu = np.empty((count, 4)), np.empty((count, 4, 4)), np.empty((count, len(target.models.names)))
+    for k, bank in zip(range(count - 1, -1, -1), told, strict=True):
+        one = belief(bank)
+        mean[k], cov[k], log_mu[k] = one.mean, one.cov, bank.log_mu
     J = ground_shift(ground, mean[:, :2])
-    cov[:, :2, :2] += J @ ground.cov @ np.swapaxes(J, 1, 2)
-    return _Part(target.looks[:last], mean, cov, np.stack([bank.log_mu for bank in banks]), target.ahead[:last])
+    cov[:, :2, :2] += J @ ground.cov @ transpose(J)
+    return _Part(seen, target.believed[:count], mean, cov, log_mu)
 
 
-def _summary(target: Target, t: Array, seen: Array, distance: float, duration: float, cov: Array) -> dict[str, Any]:
+def _summary(target: Target, whole: _Part) -> dict[str, Any]:
+    t, cov, nis = whole.seen["t"], whole.cov, target.believed[:]["nis"]
+    duration = float(t[-1] - t[0])
+    distance = float(np.sum(np.hypot(*np.diff(whole.mean[:, :2], axis=0).T)))
     speed = distance / duration
     doubt = float(np.sqrt(np.trace(cov[0, :2, :2]) / 2 + np.trace(cov[-1, :2, :2]) / 2)) / duration
     ahead = prediction_errors(target)
@@ -85,11 +84,11 @@ def _summary(target: Target, t: Array, seen: Array, distance: float, duration: f
     return {
         "t_start": float(t[0]),
         "t_end": float(t[-1]),
-        "n_frames": int(np.count_nonzero(seen)),
+        "n_frames": int(np.count_nonzero(_measured(whole.seen))),
         "distance": distance,
         "speed": speed,
         "speed_ci95": [max(0.0, speed - Z95 * doubt), speed + Z95 * doubt],
-        "nis_mean": float(np.mean(target.nis)) if target.nis else 0.0,
+        "nis_mean": float(np.nanmean(nis)) if np.isfinite(nis).any() else 0.0,
         "nis_dof": 4,
         "size": target.size.tolist(),
         "ended": target.ended_by,
@@ -97,27 +96,28 @@ def _summary(target: Target, t: Array, seen: Array, distance: float, duration: f
     }
 
 
-def _state(
-    target: Target, look: Look, later: Gaussian | None, mean: Array, cov: Array, models: dict[str, float]
-) -> dict[str, Any]:
-    speed = float(np.hypot(*mean[2:]))
-    unit = mean[2:] / max(speed, 1e-6)
-    state: dict[str, Any] = {
-        "frame": look.frame,
-        "t": look.t,
-        "position": mean[:2].tolist(),
-        "velocity": mean[2:].tolist(),
-        "covariance": ((cov + cov.T) / 2).tolist(),
-        "speed": speed,
-        "speed_sigma": float(np.sqrt(max(float(unit @ cov[2:, 2:] @ unit), 0.0))),
-        "box": {"left": look.box.tolist()},
-        "measured": look.z is not None,
-    }
-    if len(models) > 1:
-        state["models"] = {name: float(share) for name, share in models.items()}
-    if later is not None:
-        state["ahead"] = {"t": look.t + target.config.latency, "position": later.mean[:2].tolist()}
-    return state
+def _states(target: Target, whole: _Part) -> Iterator[dict[str, Any]]:
+    names, latency = target.models.names, target.config.latency
+    columns = whole.seen, whole.believed["ahead"], whole.mean, whole.cov, whole.log_mu
+    for seen, ahead, mean, cov, log_mu in zip(*columns, strict=True):
+        speed = float(np.hypot(*mean[2:]))
+        unit = mean[2:] / max(speed, 1e-6)
+        state: dict[str, Any] = {
+            "frame": int(seen["frame"]),
+            "t": float(seen["t"]),
+            "position": mean[:2].tolist(),
+            "velocity": mean[2:].tolist(),
+            "covariance": symmetrise(cov).tolist(),
+            "speed": speed,
+            "speed_sigma": float(np.sqrt(max(float(unit @ cov[2:, 2:] @ unit), 0.0))),
+            "box": {"left": seen["box"].tolist()},
+            "measured": bool(np.isfinite(seen["z"][0])),
+        }
+        if len(names) > 1:
+            state["models"] = dict(zip(names, np.exp(log_mu).tolist(), strict=True))
+        if np.isfinite(ahead).all():
+            state["ahead"] = {"t": float(seen["t"]) + latency, "position": ahead.tolist()}
+        yield state
 
 
 def prediction_errors(target: Target) -> tuple[float, float] | None:
@@ -125,18 +125,18 @@ def prediction_errors(target: Target) -> tuple[float, float] | None:
 
     Against the direction in which it was then measured. Bradshaw 1997, sec. 6. None where there is too little of it.
     """
-    latency = target.config.latency
-    seen = [k for k, look in enumerate(target.looks) if look.z is not None and k < len(target.steps)]
+    latency, seen = target.config.latency, target.seen[:]
+    seen = seen[: len(target.believed)]
+    ahead, seen = target.believed[:]["ahead"][_measured(seen)], seen[_measured(seen)]
     if latency <= 0 or len(seen) < 10:
         return None
-    t = np.array([target.looks[k].t for k in seen])
-    angles = np.array([_direction(target, z[:2]) for k in seen if (z := target.looks[k].z) is not None])
-    angles = np.unwrap(angles, axis=0)  # the ground's axes may lie any way
+    t = seen["t"]
+    angles = np.unwrap([_direction(target, z[:2]) for z in seen["z"]], axis=0)  # the ground's axes may lie any way
     used = [i for i in range(len(seen)) if t[i] - t[0] >= SETTLED_S and t[i] + latency <= t[-1]]
     if len(used) < 5:
         return None
     truth = np.column_stack([np.interp(t[used] + latency, t, angles[:, c]) for c in (0, 1)])
-    told = np.array([_direction(target, b.mean[:2]) for i in used if (b := target.ahead[seen[i]]) is not None])
+    told = np.array([_direction(target, ahead[i]) for i in used])
     plane = min(_angles_ahead(t, angles, used, latency, q, truth) for q in ANGLE_Q)
     return plane, float(np.sqrt(np.mean(np.sum(wrap(told - truth) ** 2, axis=1))))
 

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator
 
 import numpy as np
 
 from visfuse_cli.maths import course, imm
 from visfuse_cli.maths.imm import Bank, Step
+from visfuse_cli.maths.kept import Banks, smoothed
 from visfuse_cli.moving.settings import FilterSettings
 from visfuse_cli.records import Array, Gaussian
 
@@ -56,10 +57,13 @@ class Courses:
 
         return imm.predict(bank, self._changes(dt), advance, course.ANGLES)
 
-    def smoothed(self, steps: Sequence[Step], t: Array) -> list[Bank]:
-        """The bank of every instant t (T,) s given all."""
-        log_p = np.stack([self._changes(dt) for dt in np.diff(t, prepend=t[0])])
-        return imm.smooth(steps, log_p, course.ANGLES)
+    def kept(self, first: Bank) -> Banks:
+        """Where a target's banks are kept, its first one in it."""
+        return Banks(first, np.ones(first.beliefs.mean.shape, bool))
+
+    def smoothed(self, banks: Banks, t: Array) -> Iterator[Bank]:
+        """The bank of every instant t (T,) s given these T, the last first."""
+        return smoothed(banks, t, self.predict, self._changes, course.ANGLES)
 
     def _changes(self, dt: float) -> Array:
         return imm.changes(len(self.names), dt, self._sojourn)

@@ -12,6 +12,7 @@ from visfuse_cli.gazing.models import Courses, combined
 from visfuse_cli.maths import course, imm
 from visfuse_cli.maths.assignment import gate_size
 from visfuse_cli.maths.imm import Bank, Step
+from visfuse_cli.maths.kept import Banks, Rows
 from visfuse_cli.maths.motion import line_start
 from visfuse_cli.moving.settings import ImmConfig
 from visfuse_cli.records import Array, Gaussian
@@ -28,16 +29,10 @@ STRETCH = 0.05  # by which a target's picture may be off the size that its dista
 START_DOUBT = 9.0  # times the covariance of the first place and velocity: the same frames are filtered again
 
 
-@dataclass(frozen=True, slots=True)
-class Look:
-    """One frame: when, where the head looked, and what was seen there: z (4,) m and m/s with R (4, 4), or nothing."""
-
-    frame: int
-    t: float
-    gaze: Array
-    box: Array
-    z: Array | None
-    R: Array
+# A frame: number, time s, box px, and what was measured, m and m/s; NaN is nothing, or out of sight.
+SEEN = [("frame", int), ("t", float), ("box", float, 4), ("z", float, 4)]
+# What was then believed: how far off the measurement was, and the place m a latency later; NaN is none.
+BELIEVED = [("nis", float), ("ahead", float, 2)]
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,7 +52,7 @@ class Expected:
 
 @dataclass(slots=True, eq=False)
 class Target:
-    """A target that is followed; `size` (2,) m of what is seen of it; a step of the bank for each look, once begun."""
+    """A target that is followed; `size` (2,) m of what is seen of it; its banks by frame, once there are some."""
 
     id: int
     head: Head
@@ -70,23 +65,30 @@ class Target:
     given: bool
     last_seen: float
     seen_since: float = -np.inf  # s: since when it is seen without a break
-    looks: list[Look] = field(default_factory=list)
-    steps: list[Step] = field(default_factory=list)
-    nis: list[float] = field(default_factory=list)
-    ahead: list[Gaussian | None] = field(default_factory=list)  # the belief a latency later, look by look
+    seen: Rows = field(default_factory=lambda: Rows(SEEN))
+    noises: list[Array] = field(default_factory=list)  # R (4, 4) of what was measured before there was a bank
+    bank: Bank | None = None
+    banks: Banks | None = None
+    believed: Rows = field(default_factory=lambda: Rows(BELIEVED))
     ended_by: str = ""
     earlier: Target | None = None  # what was seen of it before it was lost or away
 
     @property
     def box(self) -> Array | None:
         """The latest box [x, y, w, h] px; none out of sight."""
-        box = self.looks[-1].box
+        box: Array = self.seen[-1]["box"]
         return box if np.isfinite(box).all() else None
 
     @property
     def measured(self) -> bool:
         """Whether it was seen there."""
-        return self.looks[-1].z is not None
+        return bool(np.isfinite(self.seen[-1]["z"][0]))
+
+    def box_at(self, frame: int) -> Array | None:
+        """The box [x, y, w, h] px in a frame of late; none before it was begun, or out of sight."""
+        rows = (self.seen[k] for k in range(len(self.seen) - 1, -1, -1))
+        row = next((row for row in rows if row["frame"] <= frame), None)
+        return row["box"] if row is not None and np.isfinite(row["box"]).all() else None
 
     @property
     def height(self) -> float:
@@ -117,15 +119,21 @@ def start(
         return None
     target.place = place
     target.size = np.array(patches.side(quad)) * head.depth(place, target.height) / np.diag(head.lens.K)[:2]
-    measured = _measured(target, at, np.zeros((2, 2)), view.gaze, None)
-    target.looks.append(Look(view.frame, view.t, view.gaze, box_of(quad), *measured))
+    _note(target, view, quad, *_measured(target, at, np.zeros((2, 2)), view.gaze, None))
     return target
+
+
+def _note(target: Target, view: View, quad: Array, z: Array | None, R: Array) -> None:
+    """Keep what a frame told: the quad (4, 2) px, and what was measured, if anything."""
+    target.seen.append(view.frame, view.t, box_of(quad), np.nan if z is None else z)
+    if target.banks is None:
+        target.noises.append(R)
 
 
 def expect(target: Target, view: View) -> Expected:
     """Where the target is thought to be in a view."""
-    dt = view.t - target.looks[-1].t
-    step = target.models.predict(target.steps[-1].filtered, dt) if target.steps else None
+    dt = view.t - float(target.seen[-1]["t"])
+    step = target.models.predict(target.bank, dt) if target.bank is not None else None
     place = combined(step.filtered).mean[:2] if step is not None else target.place
     return Expected(step, target.quad_at(place, view.gaze), target.head.depth(place, target.height), dt)
 
@@ -142,21 +150,17 @@ def follow(target: Target, view: View, expected: Expected, hidden: float) -> Non
         quad = seen if z is not None else quad
     if step is not None:
         updated = _updated(step, z, R) if z is not None else None
-        if updated is None:
-            z = None
-        else:
-            step = updated[0]
-            target.nis.append(updated[1])
-        target.steps.append(step)
-        target.ahead.append(_later(target))
-    target.looks.append(Look(view.frame, view.t, view.gaze, box_of(quad), z, R))
+        z = z if updated is not None else None
+        _believe(target, *(updated or (step, np.nan)))
+    fresh = not target.measured
+    _note(target, view, quad, z, R)
     if z is not None and found is not None:
-        target.seen_since = target.seen_since if target.looks[-2].z is not None else view.t
+        target.seen_since = view.t if fresh else target.seen_since
         target.place, target.last_seen = z[:2], view.t
         target.colours = KEEP_LOOKS * target.colours + (1 - KEEP_LOOKS) * looks(view.picture, quad)
         if found.correlation < target.config.measure.fresh and view.t - target.seen_since > SETTLED_S:
             target.sought = patches.holding(view.levels, quad)
-    if not target.steps and sum(look.z is not None for look in target.looks) >= YOUNG:
+    if target.banks is None and np.count_nonzero(np.isfinite(target.seen[:]["z"][:, 0])) >= YOUNG:
         _begin(target)
 
 
@@ -173,9 +177,7 @@ def found_again(target: Target, view: View, quad: Array) -> Array | None:
     place = target.head.ground(target.anchor(quad), view.gaze, target.height)
     if not np.isfinite(place).all():
         return None
-    pace = (
-        max(FASTER * float(np.linalg.norm(belief(target.steps[-1].filtered).mean[2:])), FAST) if target.steps else FAST
-    )
+    pace = FAST if target.bank is None else max(FASTER * float(np.linalg.norm(belief(target.bank).mean[2:])), FAST)
     away = target.head.depth(place, target.height)
     if np.linalg.norm(place - target.place) > 0.1 * away + SLACK_M + pace * (view.t - target.last_seen):
         return None
@@ -199,31 +201,42 @@ def _measured(target: Target, at: Array, cov: Array, gaze: Array, dt: float | No
     J = target.head.jacobian(at, gaze, target.height)
     R = np.zeros((4, 4))
     R[:2, :2] = J @ (cov + measure.place_sigma**2 * np.eye(2)) @ J.T
-    before = target.looks[-1] if target.looks else None
-    if before is None or before.z is None or not dt:
+    before = target.seen[-1]["z"] if len(target.seen) else np.full(4, np.nan)
+    if not dt or np.isnan(before[0]):
         R[2:, 2:] = 1e6 * np.eye(2)
         return np.append(place, [0.0, 0.0]), R
-    still = target.head.pixels(np.append(before.z[:2], target.height), gaze)  # had only the head turned
+    still = target.head.pixels(np.append(before[:2], target.height), gaze)  # had only the head turned
     R[2:, 2:] = (measure.flow_sigma / dt) ** 2 * J @ J.T
     return np.append(place, J @ (at - still) / dt), R
 
 
 def _begin(target: Target) -> None:
-    """Begin the bank at the first look, from a line through all looks so far, and filter these."""
-    seen = [look for look in target.looks if look.z is not None]
-    t = np.array([look.t for look in seen]) - target.looks[0].t
-    places = np.array([look.z[:2] for look in seen if look.z is not None])
-    noise = START_DOUBT * np.mean([look.R[:2, :2] for look in seen], axis=0)
-    bank = target.models.start(*line_start(t, places, noise))
+    """Begin the bank at the first frame, from a line through all that was measured so far, and filter these."""
+    rows = target.seen[:]
+    measured = np.isfinite(rows["z"][:, 0])
+    noise = START_DOUBT * np.mean(np.stack(target.noises)[measured][:, :2, :2], axis=0)
+    bank = target.models.start(*line_start(rows["t"][measured] - rows["t"][0], rows["z"][measured, :2], noise))
     ways = np.broadcast_to(np.eye(6), bank.beliefs.cov.shape)
     step = Step(bank.beliefs, ways, 0 * ways, bank.beliefs, bank.log_mu, bank)
-    for k, look in enumerate(target.looks):
+    for k, R in enumerate(target.noises):
         if k:
-            step = target.models.predict(step.filtered, look.t - target.looks[k - 1].t)
-        updated = _updated(step, look.z, look.R) if look.z is not None else None
+            step = target.models.predict(step.filtered, float(rows["t"][k] - rows["t"][k - 1]))
+        updated = _updated(step, rows["z"][k], R) if measured[k] else None
         step = updated[0] if updated is not None else step
-        target.steps.append(step)
-        target.ahead.append(_later(target))
+        _believe(target, step, np.nan)
+    target.noises.clear()
+
+
+def _believe(target: Target, step: Step, nis: float) -> None:
+    """Keep what is believed after a frame, how far off its measurement was, and the place a latency later."""
+    target.bank = step.filtered
+    if target.banks is None:
+        target.banks = target.models.kept(target.bank)
+    else:
+        target.banks.append(target.bank)
+    latency = target.config.latency
+    later = combined(target.models.predict(target.bank, latency).filtered).mean[:2] if latency > 0 else np.nan
+    target.believed.append(nis, later)
 
 
 def _updated(step: Step, z: Array, R: Array) -> tuple[Step, float] | None:
@@ -233,12 +246,6 @@ def _updated(step: Step, z: Array, R: Array) -> tuple[Step, float] | None:
     if innovation.nis.min() > gate_size(len(z), GATE):
         return None
     return updated, float(np.exp(updated.filtered.log_mu) @ innovation.nis)
-
-
-def _later(target: Target) -> Gaussian | None:
-    if target.config.latency <= 0:
-        return None
-    return combined(target.models.predict(target.steps[-1].filtered, target.config.latency).filtered)
 
 
 def belief(bank: Bank) -> Gaussian:

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import numpy as np
-
 from visfuse_cli.gazing import target as one
 from visfuse_cli.gazing.find import KNOWN, Finder, View, shared
 from visfuse_cli.gazing.head import Head
@@ -39,7 +37,7 @@ class Tracker(Pursuit[Target, View, Expected, Array]):
         with self._stage("filter"):
             self._follow(view)
         self._part(t)
-        view.known.extend(each.looks[-1].box for each in self._followed)
+        view.known.extend(each.seen[-1]["box"] for each in self._followed)
         self._begin_given(view)
         if self._wanted(t):
             with self._stage("newcomers"):
@@ -85,12 +83,12 @@ class Tracker(Pursuit[Target, View, Expected, Array]):
             for view in since[1:]:
                 one.follow(new, view, one.expect(new, view), 0.0)
             for view in since:
-                view.known.append(new.looks[-1].box)
+                view.known.append(new.seen[-1]["box"])
 
     def _part_of(self, quad: Array, view: View) -> tuple[Target | None, bool]:
         """Who is followed in a part of a quad (4, 2) of a view, if anybody, and whether the quad is to be begun."""
         for each in self._followed:
-            box = next((look.box for look in each.looks if look.frame == view.frame), None)
-            if box is not None and np.isfinite(box).all() and shared(box, box_of(quad)) > KNOWN:
-                return each, not each.given and view.t - each.looks[0].t < YOUNG_S
+            box = each.box_at(view.frame)
+            if box is not None and shared(box, box_of(quad)) > KNOWN:
+                return each, not each.given and view.t - each.seen[0]["t"] < YOUNG_S
         return None, True

@@ -8,7 +8,7 @@ is batched over leading axes.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -163,20 +163,34 @@ def combined(bank: Bank, angles: tuple[int, ...] = ()) -> Gaussian:
 
 
 def smooth(steps: Sequence[Step], log_p: Array, angles: tuple[int, ...] = ()) -> list[Bank]:
-    """Every instant's bank given the whole recording: a fixed-interval smoother over pairs of models.
+    """Every instant's bank given the whole recording, as `backward` tells them; log_p (r, r)."""
+    told = backward(len(steps), lambda k: steps[k].filtered, lambda k, _: (steps[k], log_p), angles)
+    return list(told)[::-1]
 
-    log_p (r, r), or that of the way to every step (T, r, r), of which the first is not read.
+
+def backward(
+    instants: int,
+    filtered: Callable[[int], Bank],
+    way: Callable[[int, Bank], tuple[Step, Array]],
+    angles: tuple[int, ...] = (),
+) -> Iterator[Bank]:
+    """Every instant's bank given the whole recording, the last first: a fixed-interval smoother over pairs of models.
+
+    filtered(k) is the bank after instant k; way(k, filtered(k - 1)) the step that led there (its own `filtered` is not
+    read) and log p_ij (r, r) over it: kept, or made again, so that banks are all that has to be kept.
     What the future says of the state, if model i comes next, is the step back from model i's smoothed state, less what
     it began with; each model j of now takes it in as a measurement, and the pairs are weighed by how well j fits it.
     With one model this is the Rauch-Tung-Striebel pass. Raises LinAlgError where a covariance is singular.
     """
-    banks, ways = [steps[-1].filtered], [log_p] * len(steps) if log_p.ndim == 2 else log_p
-    for now, after, way in zip(steps[-2::-1], steps[:0:-1], ways[:0:-1], strict=True):
-        banks.append(_smoothed(now.filtered, after, banks[-1], way, angles))
-    return banks[::-1]
+    later = filtered(instants - 1)
+    yield later
+    for k in range(instants - 1, 0, -1):
+        now = filtered(k - 1)
+        later = _smoothed(now, *way(k, now), later, angles)
+        yield later
 
 
-def _smoothed(now: Bank, after: Step, later: Bank, log_p: Array, angles: tuple[int, ...]) -> Bank:
+def _smoothed(now: Bank, after: Step, log_p: Array, later: Bank, angles: tuple[int, ...]) -> Bank:
     """The bank now, given the smoothed bank one step later."""
     H, value = _of_the_future(after, later, angles)
     P = now.beliefs.cov[..., :, None, :, :]  # of model j now, before model i: (..., j, i, n, n)

@@ -49,10 +49,9 @@ class Drawn:
                 drawing.label(image, text, np.array([x, y - 4.0]), self.colour)
 
 
-def inset(picture: Image, ways: list[Array], tracks: list[Drawn], frame: int, now: int) -> None:
+def inset(picture: Image, ego: Array, tracks: list[Drawn], frame: int, now: int) -> None:
     """Draw the map into the lower right corner: the camera's way (n, 3) so far and the targets', seen from above."""
     side = int(SHARE * picture.shape[0])
-    ego = ways[0]
     every = np.concatenate([ego, *(track.places for track in tracks)])[:, [0, 2]]
     low, high = every.min(axis=0) - 1, every.max(axis=0) + 1
     scale = side / float((high - low).max())

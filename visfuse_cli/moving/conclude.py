@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from visfuse_cli.maths import imm
+from visfuse_cli.maths.gaussian import symmetrise, transpose
+from visfuse_cli.moving.journey import Ride
 from visfuse_cli.moving.models import P, V
-from visfuse_cli.moving.target import Target
+from visfuse_cli.moving.target import VIEWS, Target
 from visfuse_cli.records import Array, Gaussian, StereoRig
 
 FEWEST = 2  # measurements that make a part of a track
@@ -24,172 +27,136 @@ SLOWEST = 0.12  # m/s: what is slower on the whole is not said to move
 class Settled:
     """A finished track over T instants, in the world: belief of position and velocity (T, 6), and what was seen."""
 
-    id: int
-    frame: list[int]
-    t: Array
+    target: Target
+    seen: NDArray[np.void]  # rows of `target.SEEN`
     belief: Gaussian
     log_mu: Array  # (T, r)
-    names: tuple[str, ...]
-    boxes: list[dict[str, Array]]
-    measured: Array
-    ahead: list[Gaussian | None]
     nis: Array  # of each measurement but the first
-    size: Array
-    ended_by: str
+
+    @property
+    def measured(self) -> NDArray[np.bool_]:
+        """Whether the target was seen."""
+        return np.isfinite(self.seen["nis"])
 
 
-def conclude(target: Target, pose_cov: Callable[[int], Array]) -> Settled | None:
+def conclude(target: Target, ride: Ride) -> Settled | None:
     """Settle a track; None where it was measured too rarely, or was found unaided and stands still.
 
-    pose_cov tells the covariance (4, 4) of the camera's position and yaw at a frame. What was seen of the target before
-    it was away or lost comes first.
+    What was seen of the target before it was away or lost comes first.
     """
     chain = [target]
     while (earlier := chain[-1].earlier) is not None:
         chain.append(earlier)
-    parts = [part for each in chain[::-1] if (part := _part(each, pose_cov)) is not None]
+    parts = [part for each in chain[::-1] if (part := _part(each, ride)) is not None]
     if not parts:
         return None
-    first, *others = parts
-    for other in others:
-        first = _joined(first, other)
-    if np.count_nonzero(first.measured) < target.config.life.min_frames:
+    settled = _joined(parts)
+    if np.count_nonzero(settled.measured) < target.config.life.min_frames:
         return None
-    return first if target.given or _moved(target, first) else None
+    return settled if target.given or _moved(settled) else None
 
 
-def _part(target: Target, pose_cov: Callable[[int], Array]) -> Settled | None:
+def _part(target: Target, ride: Ride) -> Settled | None:
     """What was seen of a target without a break; None where that is next to nothing."""
-    measured = np.array([seen.measured for seen in target.history])
-    if np.count_nonzero(measured) < FEWEST:
+    seen = target.seen[:]
+    measured = np.flatnonzero(np.isfinite(seen["nis"]))
+    if len(measured) < FEWEST:
         return None
-    last = int(np.flatnonzero(measured)[-1]) + 1
-    history, measured = target.history[:last], measured[:last]
-    t = np.array([seen.t for seen in history])
-    if target.config.smooth:
-        banks = target.models.smoothed([seen.step for seen in history], t)
-    else:
-        banks = [seen.step.filtered for seen in history]
-    common = [imm.combined(bank) for bank in banks]
-    mean = np.stack([belief.mean for belief in common])[:, :6]
-    cov = np.stack([belief.cov for belief in common])[:, :6, :6]
-    of_pose = _of_pose(mean, np.stack([pose_cov(seen.frame) for seen in history]), history)
-    return Settled(
-        id=target.id,
-        frame=[seen.frame for seen in history],
-        t=t,
-        belief=Gaussian(mean, cov + of_pose + _of_template(target.rig, mean, history)),
-        log_mu=np.stack([bank.log_mu for bank in banks]),
-        names=target.models.names,
-        boxes=[seen.boxes for seen in history],
-        measured=measured,
-        ahead=[seen.ahead for seen in history],
-        nis=np.array([seen.nis for seen in history])[measured][1:],
-        size=target.size,
-        ended_by=target.ended_by,
-    )
+    seen = seen[: measured[-1] + 1]
+    banks, count = target.banks, len(seen)
+    told = target.models.smoothed(banks, seen["t"]) if target.config.smooth else banks.backward(count)
+    mean, cov, log_mu = np.empty((count, 6)), np.empty((count, 6, 6)), np.empty((count, len(target.models.names)))
+    for k, bank in zip(range(count - 1, -1, -1), told, strict=True):
+        belief = imm.combined(bank)
+        mean[k], cov[k], log_mu[k] = belief.mean[:6], belief.cov[:6, :6], bank.log_mu
+    poses = ride.at(seen["frame"])
+    cov += _of_pose(mean, poses) + _of_template(target.rig, mean, poses)
+    return Settled(target, seen, Gaussian(mean, cov), log_mu, seen["nis"][measured[1:]])
 
 
-def _joined(first: Settled, then: Settled) -> Settled:
-    """Two parts of one track."""
-    keep = int(np.searchsorted(first.frame, then.frame[0]))  # it was still predicted as it was found again
-    belief = Gaussian(
-        np.concatenate([first.belief.mean[:keep], then.belief.mean]),
-        np.concatenate([first.belief.cov[:keep], then.belief.cov]),
-    )
-    return replace(
-        then,
-        frame=first.frame[:keep] + then.frame,
-        t=np.concatenate([first.t[:keep], then.t]),
-        belief=belief,
-        log_mu=np.concatenate([first.log_mu[:keep], then.log_mu]),
-        boxes=first.boxes[:keep] + then.boxes,
-        measured=np.concatenate([first.measured[:keep], then.measured]),
-        ahead=first.ahead[:keep] + then.ahead,
-        nis=np.concatenate([first.nis, then.nis]),
-    )
+def _joined(parts: Sequence[Settled]) -> Settled:
+    """The parts of one track, one after another."""
+    belief = Gaussian(*(np.concatenate([getattr(part.belief, name) for part in parts]) for name in ("mean", "cov")))
+    seen, log_mu, nis = (np.concatenate([getattr(part, name) for part in parts]) for name in ("seen", "log_mu", "nis"))
+    return Settled(parts[-1].target, seen, belief, log_mu, nis)
 
 
-def _of_pose(mean: Array, pose_cov: Array, history: list[Any]) -> Array:
+def _of_pose(mean: Array, poses: NDArray[np.void]) -> Array:
     """What the camera's own doubt adds (T, 6, 6): its place, and its turning times the distance."""
     added = np.zeros((len(mean), 6, 6))
-    reach = mean[:, :3] - np.stack([seen.head.T for seen in history])
+    reach = mean[:, :3] - poses["T"]
     turn = np.stack([-reach[:, 2], 0 * reach[:, 0], reach[:, 0]], axis=1)  # d position / d theta
     J = np.concatenate([np.tile(np.eye(3), (len(mean), 1, 1)), turn[:, :, None]], axis=2)
-    added[:, :3, :3] = J @ pose_cov @ np.swapaxes(J, 1, 2)
+    added[:, :3, :3] = J @ poses["cov"] @ transpose(J)
     return added
 
 
-def _of_template(rig: StereoRig, mean: Array, history: list[Any]) -> Array:
+def _of_template(rig: StereoRig, mean: Array, poses: NDArray[np.void]) -> Array:
     """What the template's own place in the target adds (T, 6, 6): it stays off as it is and does not average out."""
     added = np.zeros((len(mean), 6, 6))
     fx, fy = np.diag(rig.left.K)[:2]
-    for k, seen in enumerate(history):
-        x, y, z = seen.head.inside(mean[k, :3])
-        J = np.array(
-            [
-                [z / fx, 0, -x * z / (fx * rig.baseline)],
-                [0, z / fy, -y * z / (fx * rig.baseline)],
-                [0, 0, -(z**2) / (fx * rig.baseline)],
-            ]
-        )
-        J = seen.head.R @ J * DRIFT_PX
-        added[k, :3, :3] = J @ J.T
+    x, y, z = np.moveaxis((mean[:, None, :3] - poses["T"][:, None]) @ poses["R"], -1, 0)[..., 0]
+    J = np.zeros((len(mean), 3, 3))  # of the place in the camera's frame by u, v and disparity
+    J[:, 0, 0], J[:, 1, 1] = z / fx, z / fy
+    J[:, :, 2] = -np.stack([x, y, z], axis=1) * (z / (fx * rig.baseline))[:, None]
+    J = poses["R"] @ J * DRIFT_PX
+    added[:, :3, :3] = J @ transpose(J)
     return added
 
 
-def _moved(target: Target, settled: Settled) -> bool:
+def _moved(settled: Settled) -> bool:
     """Whether a target found unaided went anywhere in the world, beyond what the camera's pose may be off by."""
-    place, cov = settled.belief.mean[:, :3], settled.belief.cov
+    place, cov, t = settled.belief.mean[:, :3], settled.belief.cov, settled.seen["t"]
     off = np.linalg.norm(place - place[0], axis=1)
     far = int(np.argmax(off))  # it may come back
     doubt = float(np.sqrt(np.trace(cov[0, :3, :3]) + np.trace(cov[far, :3, :3])))
-    least = target.config.life.min_moved + EGO_SHARE * target.away + 2 * doubt
-    return bool(off[far] > least and off[far] / max(float(settled.t[far] - settled.t[0]), 1e-6) > SLOWEST)
+    least = settled.target.config.life.min_moved + EGO_SHARE * settled.target.away + 2 * doubt
+    return bool(off[far] > least and off[far] / max(float(t[far] - t[0]), 1e-6) > SLOWEST)
 
 
-def track_record(path: Settled, latency: float) -> dict[str, Any]:
-    """One track of tracks.json."""
-    mean, cov = path.belief.mean, path.belief.cov
-    speed = np.linalg.norm(mean[:, V], axis=1)
-    unit = mean[:, V] / np.maximum(speed, 1e-6)[:, None]
-    sigma = np.sqrt(np.clip(np.einsum("ti,tij,tj->t", unit, cov[:, V, V], unit), 0, None))
-    duration = float(path.t[-1] - path.t[0])
-    distance = float(np.sum(np.linalg.norm(np.diff(mean[:, P], axis=0), axis=1))) if len(path.t) > 1 else 0.0
+def track_record(path: Settled) -> dict[str, Any]:
+    """One track of tracks.json; its states are made as they are written."""
+    mean, cov, t = path.belief.mean, path.belief.cov, path.seen["t"]
+    duration = float(t[-1] - t[0])
+    distance = float(np.sum(np.linalg.norm(np.diff(mean[:, P], axis=0), axis=1))) if len(t) > 1 else 0.0
     mean_speed = distance / duration if duration > 0 else 0.0
     doubt = float(np.sqrt(np.trace(cov[0, P, P]) / 3 + np.trace(cov[-1, P, P]) / 3)) / duration if duration > 0 else 0.0
-    states = []
-    for k in range(len(path.t)):
-        state: dict[str, Any] = {
-            "frame": path.frame[k],
-            "t": float(path.t[k]),
-            "position": mean[k, P].tolist(),
-            "velocity": mean[k, V].tolist(),
-            "covariance": ((cov[k] + cov[k].T) / 2).tolist(),
-            "speed": float(speed[k]),
-            "speed_sigma": float(sigma[k]),
-            "box": {view: box.tolist() for view, box in path.boxes[k].items()},
-            "measured": bool(path.measured[k]),
-        }
-        if len(path.names) > 1:
-            state["models"] = dict(zip(path.names, np.exp(path.log_mu[k]).tolist(), strict=True))
-        later = path.ahead[k]
-        if later is not None:
-            state["ahead"] = {"t": float(path.t[k] + latency), "position": later.mean[P].tolist()}
-        states.append(state)
     return {
-        "id": path.id,
+        "id": path.target.id,
         "summary": {
-            "t_start": float(path.t[0]),
-            "t_end": float(path.t[-1]),
+            "t_start": float(t[0]),
+            "t_end": float(t[-1]),
             "n_frames": int(np.count_nonzero(path.measured)),
             "distance": distance,
             "speed": mean_speed,
             "speed_ci95": [max(0.0, mean_speed - Z95 * doubt), mean_speed + Z95 * doubt],
             "nis_mean": float(np.mean(path.nis)) if len(path.nis) else 0.0,
             "nis_dof": 5,
-            "size": path.size.tolist(),
-            "ended": path.ended_by,
+            "size": path.target.size.tolist(),
+            "ended": path.target.ended_by,
         },
-        "states": states,
+        "states": _states(path),
     }
+
+
+def _states(path: Settled) -> Iterator[dict[str, Any]]:
+    names, latency = path.target.models.names, path.target.config.latency
+    for seen, mean, cov, log_mu in zip(path.seen, path.belief.mean, path.belief.cov, path.log_mu, strict=True):
+        speed = float(np.linalg.norm(mean[V]))
+        unit = mean[V] / max(speed, 1e-6)
+        state: dict[str, Any] = {
+            "frame": int(seen["frame"]),
+            "t": float(seen["t"]),
+            "position": mean[P].tolist(),
+            "velocity": mean[V].tolist(),
+            "covariance": symmetrise(cov).tolist(),
+            "speed": speed,
+            "speed_sigma": float(np.sqrt(max(float(unit @ cov[V, V] @ unit), 0.0))),
+            "box": {view: seen[view].tolist() for view in VIEWS if np.isfinite(seen[view]).all()},
+            "measured": bool(np.isfinite(seen["nis"])),
+        }
+        if len(names) > 1:
+            state["models"] = dict(zip(names, np.exp(log_mu).tolist(), strict=True))
+        if np.isfinite(seen["ahead"]).all():
+            state["ahead"] = {"t": float(seen["t"] + latency), "position": seen["ahead"].tolist()}
+        yield state

@@ -5,11 +5,43 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 
 import numpy as np
+from numpy.typing import NDArray
 
 from visfuse_cli.maths import odometry
+from visfuse_cli.maths.kept import Rows
 from visfuse_cli.maths.odometry import Poses
+from visfuse_cli.moving.head import Head
 from visfuse_cli.moving.settings import OdometrySettings
 from visfuse_cli.records import Array
+
+POSE = [("frame", int), ("R", float, (3, 3)), ("T", float, 3), ("cov", float, (4, 4))]
+
+
+class Ride:
+    """The camera's way, told by its pose at a time (s); that of every frame that is looked at is kept."""
+
+    def __init__(self, pose: Callable[[float], Poses]) -> None:
+        self._pose, self._rows = pose, Rows(POSE)
+
+    def look(self, frame: int, t: float) -> Head:
+        """The head at a frame, which comes after all before it."""
+        pose = self._pose(t)
+        self._rows.append(frame, pose.R[0], pose.T[0], pose.cov[0])
+        return Head(t, pose.R[0], pose.T[0])
+
+    def head(self, t: float) -> Head:
+        """The head at any time (s)."""
+        pose = self._pose(t)
+        return Head(t, pose.R[0], pose.T[0])
+
+    def kept(self) -> NDArray[np.void]:
+        """A row for every frame looked at: `frame`, `R` (3, 3), `T` (3,) m and `cov` (4, 4) of place and yaw."""
+        return np.asarray(self._rows[:])
+
+    def at(self, frames: Array) -> NDArray[np.void]:
+        """The rows of some frames (n,) that were looked at."""
+        rows = self.kept()
+        return rows[np.searchsorted(rows["frame"], frames)]
 
 
 def journey(form: str, columns: Mapping[str, Array], settings: OdometrySettings) -> Callable[[float], Poses]:

@@ -6,7 +6,7 @@ without a centre thinks the target at its own: zero, with a variance.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator
 from functools import lru_cache
 
 import numpy as np
@@ -14,6 +14,7 @@ import numpy as np
 from visfuse_cli.maths import imm, motion
 from visfuse_cli.maths.gaussian import times
 from visfuse_cli.maths.imm import Bank, Step
+from visfuse_cli.maths.kept import Banks, smoothed
 from visfuse_cli.moving.settings import FilterSettings
 from visfuse_cli.records import Array, Gaussian
 
@@ -36,7 +37,7 @@ class Models:
     def __init__(self, settings: FilterSettings) -> None:
         self._settings = settings
         self.names = tuple(INDEX) if settings.kind == "imm" else (settings.kind,)
-        self._ways = lru_cache(INTERVALS)(self._motions)  # shared by all steps of one length: they are kept for long
+        self._ways = lru_cache(INTERVALS)(self._motions)
 
     def start(self, position: Gaussian, velocity: Gaussian) -> Bank:
         """Every model from a place (3,) and a velocity (3,), equally likely."""
@@ -50,9 +51,13 @@ class Models:
         F, Q = self._ways(dt)
         return imm.predict(bank, self._changes(dt), lambda x: (times(F, x), F, Q))
 
-    def smoothed(self, steps: Sequence[Step], t: Array) -> list[Bank]:
-        """The bank of every instant t (T,) s given all."""
-        return imm.smooth(steps, np.stack([self._changes(dt) for dt in np.diff(t, prepend=t[0])]))
+    def kept(self, first: Bank) -> Banks:
+        """Where a target's banks are kept, its first one in it."""
+        return Banks(first, np.array([np.isin(range(SIZE), INDEX[name]) for name in self.names]))
+
+    def smoothed(self, banks: Banks, t: Array) -> Iterator[Bank]:
+        """The bank of every instant t (T,) s given these T, the last first."""
+        return smoothed(banks, t, self.predict, self._changes)
 
     def _changes(self, dt: float) -> Array:
         return imm.changes(len(self.names), dt, self._settings.sojourn)

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from visfuse_cli.maths import imm
 from visfuse_cli.maths.imm import Bank, Step
+from visfuse_cli.maths.kept import Banks, Rows
 from visfuse_cli.maths.planes import in_right, projected, triangulated
 from visfuse_cli.moving.head import Head, Pair
 from visfuse_cli.moving.measure import across, measurement, updated
-from visfuse_cli.moving.models import SIZE, Models, P, V
+from visfuse_cli.moving.models import Models, P, V
 from visfuse_cli.moving.settings import ImmConfig
 from visfuse_cli.records import Array, Gaussian, StereoRig
 from visfuse_cli.vision import patches
@@ -25,19 +27,9 @@ NEAREST = 0.2  # m before the camera
 REACH = 3.0  # px of disparity around the expected one, at least
 FASTER, FAST, SLACK_M = 2.0, 1.5, 0.5  # times its pace, m/s, m: how far a lost target may have come
 
-
-@dataclass(frozen=True, slots=True)
-class Seen:
-    """One frame: its number, time, head, boxes by view, whether it was measured, and the bank before and after."""
-
-    frame: int
-    t: float
-    head: Head
-    boxes: dict[str, Array]
-    measured: bool
-    step: Step
-    nis: float
-    ahead: Gaussian | None  # the common belief a latency later
+VIEWS = ("left", "right")
+# A frame: number, time s, how far off the measurement was, boxes px, place m a latency later; NaN is none, or unseen.
+SEEN = [("frame", int), ("t", float), ("nis", float), *((view, float, 4) for view in VIEWS), ("ahead", float, 3)]
 
 
 @dataclass(slots=True, eq=False)
@@ -58,22 +50,15 @@ class Target:
     head: Head
     given: bool
     last_seen: float
-    history: list[Seen] = field(default_factory=list)
+    banks: Banks  # frame by frame
+    seen: Rows = field(default_factory=lambda: Rows(SEEN))
+    box: Array | None = None  # the latest left one [x, y, w, h] px; none out of sight
+    measured: bool = True  # whether it was seen there
     ended_by: str = ""
     away: float = 0.0  # m that the camera moved since the target began
     seen_since: float = -np.inf  # s: since when it is seen without a break
     alone_at: float = 0.0  # s: when last no other target was where this one is
     earlier: Target | None = None
-
-    @property
-    def box(self) -> Array | None:
-        """The latest left box [x, y, w, h] px; none out of sight."""
-        return self.history[-1].boxes.get("left")
-
-    @property
-    def measured(self) -> bool:
-        """Whether it was seen there."""
-        return self.history[-1].measured
 
     @property
     def belief(self) -> Gaussian:
@@ -121,12 +106,19 @@ def start(
     cov = sigma**2 * np.outer(rays, rays) + (0.005 * place[2]) ** 2 * np.eye(3)
     bank = models.start(Gaussian(head.outside(place), head.R @ cov @ head.R.T), velocity)
     sought, seen = patches.holding(pair.levels, left), looks(pair.pictures["left"], left)
-    target = Target(identity, rig, config, models, bank, size, sought, seen, head, given, head.t, alone_at=head.t)
-    nothing = np.zeros_like(bank.beliefs.cov)
-    first = Step(bank.beliefs, nothing + np.eye(SIZE), nothing, bank.beliefs, bank.log_mu, bank)
-    boxes = {"left": box_of(left), "right": box_of(right)}
-    target.history.append(Seen(pair.frame, head.t, head, boxes, True, first, 0.0, None))
-    return target
+    own = Target(identity, rig, config, models, bank, size, sought, seen, head, given, head.t, models.kept(bank))
+    own.alone_at = head.t
+    _note(own, pair, {"left": left, "right": right}, 0.0)
+    return own
+
+
+def _note(target: Target, pair: Pair, quads: Mapping[str, Array], nis: float) -> None:
+    """Keep what a frame told: the quads (4, 2) px by view, how far off the measurement was, and the place ahead."""
+    boxes = {view: box_of(quad) for view, quad in quads.items()}
+    target.box, target.measured = boxes.get("left"), bool(np.isfinite(nis))
+    latency = target.config.latency
+    later = imm.combined(target.models.predict(target.bank, latency).filtered).mean[P] if latency > 0 else np.nan
+    target.seen.append(pair.frame, pair.t, nis, *(boxes.get(view, np.nan) for view in VIEWS), later)
 
 
 def expect(target: Target, head: Head) -> Expected:
@@ -155,7 +147,7 @@ def follow(target: Target, pair: Pair, expected: Expected, hidden: float) -> Non
     target.bank, target.head = step.filtered, head
     quads = expected.quads
     found = _look(target, pair, expected) if quads and hidden < HIDDEN else None
-    nis, measured = 0.0, False
+    nis = np.nan
     if found is not None:
         left, right, R, alignment = found
         R[0, 0] += (hidden * patches.side(left)[0]) ** 2  # what is left to be seen lies to one side
@@ -164,15 +156,12 @@ def follow(target: Target, pair: Pair, expected: Expected, hidden: float) -> Non
         if after is not None:
             step, nis = after
             target.bank = step.filtered
-            measured, quads = True, {"left": left, "right": right}
-            target.seen_since = target.seen_since if target.history[-1].measured else head.t
+            quads = {"left": left, "right": right}
+            target.seen_since = target.seen_since if target.measured else head.t
             target.last_seen = head.t
             _refresh(target, pair, left, alignment)
-    boxes = {view: box_of(quad) for view, quad in quads.items()}
-    later = None
-    if target.config.latency > 0:
-        later = imm.combined(target.models.predict(target.bank, target.config.latency).filtered)
-    target.history.append(Seen(pair.frame, head.t, head, boxes, measured, step, nis, later))
+    target.banks.append(target.bank)
+    _note(target, pair, quads, nis)
 
 
 def alike(target: Target, pair: Pair, quad: Array) -> bool:
@@ -187,10 +176,10 @@ def found_again(target: Target, pair: Pair, middle: Array, depth: float) -> Arra
     """
     focal = np.diag(target.rig.left.K)[:2]
     place = pair.head.outside(depth * (np.linalg.inv(target.rig.left.K) @ np.append(middle, 1.0)))
-    last = next(seen for seen in target.history[::-1] if seen.measured)
-    then = imm.combined(last.step.filtered).mean
+    last = int(np.flatnonzero(np.isfinite(target.seen[:]["nis"]))[-1])
+    then = imm.combined(target.banks[last]).mean
     pace = max(FASTER * float(np.linalg.norm(then[V])), FAST)
-    if np.linalg.norm(place - then[P]) > 0.1 * depth + SLACK_M + pace * (pair.head.t - last.t):
+    if np.linalg.norm(place - then[P]) > 0.1 * depth + SLACK_M + pace * (pair.t - target.last_seen):
         return None
     half = target.size * focal / depth / 2
     quad = middle + half * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1.0]])

@@ -26,8 +26,7 @@ from visfuse_cli.files.video import VideoSource
 from visfuse_cli.files.video_writer import VideoWriter
 from visfuse_cli.moving.annotate import Drawn, inset, together
 from visfuse_cli.moving.conclude import conclude, track_record
-from visfuse_cli.moving.head import Head
-from visfuse_cli.moving.journey import journey
+from visfuse_cli.moving.journey import Ride, journey
 from visfuse_cli.moving.models import INDEX
 from visfuse_cli.moving.settings import ImmConfig
 from visfuse_cli.moving.target import Target
@@ -69,12 +68,8 @@ class StereoRun:
         for name, lens in (("M1", self._rig.left), ("M2", self._rig.right)):
             check_size(calibration, name, lens, self._size, self._rig.image_size)
         check_inside(init, self._given, self._size)
-        self._pose = journey(sensors.form, sensors.columns, self._config.odometry)
+        self._ride = Ride(journey(sensors.form, sensors.columns, self._config.odometry))
         self._straighten = _Pictures(self._rig, self._size)
-        self._frames: list[int] = []
-        self._ways: list[Array] = []  # (3,) m
-        self._turns: list[Array] = []  # (3, 3)
-        self._covs: list[Array] = []  # (4, 4)
 
     def follow(self, sources: dict[str, VideoSource], run_: Run) -> Iterator[dict[str, Any] | None]:
         """The record of every target that was followed, None for one that does not count."""
@@ -82,7 +77,8 @@ class StereoRun:
         for pair in _pairs(sources, run_):
             check_covered(self._sensor_file, self.sensors, pair.t)
             run_.count("frames")
-            frame, head = pair.frames["left"].index, self._head(pair.t, keep=pair.frames["left"].index)
+            frame = pair.frames["left"].index
+            head = self._ride.look(frame, pair.t)
             with run_.stage("straighten"):
                 pictures = self._straighten.straight(pair)
             for target in tracker.step(pictures, frame, head):
@@ -102,12 +98,12 @@ class StereoRun:
 
     def extra(self) -> tuple[dict[str, Any], dict[str, Any]]:
         """What the summary and run.json hold besides."""
-        way = np.stack(self._ways) if self._ways else np.zeros((0, 3))
-        driven = float(np.sum(np.linalg.norm(np.diff(way, axis=0), axis=1)))
+        kept = self._ride.kept()
+        driven = float(np.sum(np.linalg.norm(np.diff(kept["T"], axis=0), axis=1)))
         ego = {
-            "frame": self._frames,
-            "position": way.round(6).tolist(),
-            "rotation": [R.round(9).tolist() for R in self._turns],  # x_world = rotation x_camera + position
+            "frame": kept["frame"].tolist(),
+            "position": kept["T"].round(6).tolist(),
+            "rotation": kept["R"].round(9).tolist(),  # x_world = rotation x_camera + position
         }
         return {"ego_distance": driven}, {"ego": ego}
 
@@ -115,33 +111,22 @@ class StereoRun:
         """Write both views side by side with a map, from a second decode."""
         units = self._config.display.units
         tracks = [Drawn(record, np.array(record["summary"]["size"]), units) for record in records]
-        index = {frame: k for k, frame in enumerate(self._frames)}
-        ego = np.stack(self._ways)
+        ego = self._ride.kept()
         wide, high = 2 * (self._size[0] // 2 * 2), self._size[1] // 2 * 2
         rate = sources["left"].nominal_rate
         with VideoWriter(path, wide, high, rate) as writer, run_.background(writer) as out:
             for pair in _pairs(sources, run_):
-                frame, head = pair.frames["left"].index, self._head(pair.t)
+                frame, head = pair.frames["left"].index, self._ride.head(pair.t)
                 pictures = {name: picture.copy() for name, picture in self._straighten.straight(pair).items()}
                 for track in tracks:
                     track.draw(pictures, frame, self._rig, head)
                 picture = together(pictures["left"], pictures["right"])
-                inset(picture, [ego], tracks, frame, index[frame])
+                inset(picture, ego["T"], tracks, frame, int(np.searchsorted(ego["frame"], frame)))
                 out.write(picture, pair.t)
 
-    def _head(self, t: float, keep: int | None = None) -> Head:
-        pose = self._pose(t)
-        if keep is not None:
-            self._frames.append(keep)
-            self._ways.append(pose.T[0])
-            self._turns.append(pose.R[0])
-            self._covs.append(pose.cov[0])
-        return Head(t, pose.R[0], pose.T[0])
-
     def _settled(self, target: Target) -> dict[str, Any] | None:
-        at = {frame: k for k, frame in enumerate(self._frames)}
-        path = conclude(target, lambda frame: self._covs[at[frame]])
-        return None if path is None else track_record(path, self._config.latency)
+        path = conclude(target, self._ride)
+        return None if path is None else track_record(path)
 
 
 def _straight(quad: Array | None, lens: Lens) -> Array | None:
