@@ -51,7 +51,7 @@ def test_banks_come_back_as_they_were_and_the_steps_between_them_are_made_again(
         same(one, other, 1e-9)  # where arrays lie in memory decides on the last bit of a product
 
 
-def same(one, other, rtol=0.0):
+def same(one, other, rtol=1e-12):
     np.testing.assert_allclose(one.beliefs.mean, other.beliefs.mean, rtol, rtol / 1e3)
     np.testing.assert_allclose(one.beliefs.cov, other.beliefs.cov, rtol, rtol / 1e3)
     np.testing.assert_allclose(one.log_mu, other.log_mu, rtol, rtol)
