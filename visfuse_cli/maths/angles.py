@@ -19,5 +19,6 @@ def wrap_at(vector: Array, angles: tuple[int, ...]) -> Array:
     if not angles:
         return vector
     wrapped = vector.copy()
-    wrapped[..., angles] = wrap(vector[..., angles])
+    for k in angles:
+        wrapped[..., k] = wrap(vector[..., k])
     return wrapped

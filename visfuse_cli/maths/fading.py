@@ -13,6 +13,7 @@ from visfuse_cli.records import Array, Gaussian, Innovation
 ALPHA = (0.1, 0.1, 2.8)  # weights of x, y and theta; they sum to 3. Lou 2002, sec. 4.1
 MEMORY = 0.8  # share of U kept at each measurement; the paper's recursion forgets in three and spoils smooth motion
 SOFTENING = 2.5  # measurement noise subtracted from U this many times, so that noise alone seldom fades
+TINY = float(np.finfo(float).tiny)
 LIMIT = 20.0  # largest factor; one outlier must not erase the past
 
 
@@ -62,7 +63,7 @@ def fading_factor(
     N = weighted_trace(U - H @ Q @ transpose(H) - softening * R)
     M = weighted_trace(H @ spread @ transpose(H))
     # The divisor is kept where the quotient stays within the limit, so that an exactly known past cannot overflow it.
-    return np.clip(N / np.maximum(M, np.abs(N) / limit + np.finfo(float).tiny), 1.0, limit)
+    return np.clip(N / np.maximum(M, np.abs(N) / limit + TINY), 1.0, limit)
 
 
 def update(

@@ -16,6 +16,7 @@ STEERING_LIMIT = 0.7  # rad; no road car's wheels turn further, and tan(phi) sta
 BICYCLE_MEASUREMENT = np.array([[1.0, 0, 0, 0, 0], [0, 1, 0, 0, 0], [0, 0, 0, 1, 0]])  # Lou 2002, eq. 2
 # Three Gauss points integrate polynomials of degree 5; on a straight path the bicycle's noise needs degree 4.
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(3)
+STRIKES = np.append((1 + NODES) / 2, 1.0)  # the points as shares of a step, and the whole of it
 
 
 def constant_velocity(dt: ArrayLike, dims: int = 2) -> Array:
@@ -137,25 +138,27 @@ def bicycle(x: Array, dt: ArrayLike, wheelbase: ArrayLike, straighten: float = 0
     tau = np.tan(phi * on_average)
     way, turn = v * dt, v * dt * tau / wheelbase
     chord, chord_slope = sinc(turn / 2)
-    along, across = axes(theta + turn / 2)
     # The rear axle's chord plus the turn of the half wheelbase ahead of it; both point along or across mid-heading.
-    course = along + (tau / 2)[..., None] * across
-    course_turned = across - (tau / 2)[..., None] * along
-    moved = (way * chord)[..., None] * course
-    by_turn = way[..., None] * ((chord_slope / 2)[..., None] * course + (chord / 2)[..., None] * course_turned)
+    c, s = np.cos(theta + turn / 2), np.sin(theta + turn / 2)
+    course_x, course_y = c - tau / 2 * s, s + tau / 2 * c
+    arc, bent, straight = way * chord, chord_slope / 2, chord / 2
+    by_turn_x, by_turn_y = way * (bent * course_x - straight * course_y), way * (bent * course_y + straight * course_x)
 
-    tau_slope = 1 + tau**2
-    F = np.zeros((*moved.shape[:-1], 5, 5))
-    F[..., range(5), range(5)] = 1
-    F[..., :2, 2] = (dt * chord)[..., None] * course + by_turn * (dt * tau / wheelbase)[..., None]
-    F[..., :2, 3] = (way * chord)[..., None] * course_turned
-    by_steering = (way * chord / 2)[..., None] * across + by_turn * (way / wheelbase)[..., None]
-    F[..., :2, 4] = (tau_slope * on_average)[..., None] * by_steering
-    F[..., 3, 2] = dt * tau / wheelbase
-    F[..., 3, 4] = way * tau_slope * on_average / wheelbase
+    tau_slope, by_speed, by_length = 1 + tau**2, dt * tau / wheelbase, way / wheelbase
+    F = np.zeros((*turn.shape, 5, 5))
+    for k in range(4):
+        F[..., k, k] = 1
+    F[..., 0, 2], F[..., 1, 2] = (
+        dt * chord * course_x + by_turn_x * by_speed,
+        dt * chord * course_y + by_turn_y * by_speed,
+    )
+    F[..., 0, 3], F[..., 1, 3] = -arc * course_y, arc * course_x
+    F[..., 0, 4] = tau_slope * on_average * (-arc / 2 * s + by_turn_x * by_length)
+    F[..., 1, 4] = tau_slope * on_average * (arc / 2 * c + by_turn_y * by_length)
+    F[..., 3, 2], F[..., 3, 4] = by_speed, way * tau_slope * on_average / wheelbase
     F[..., 4, 4] = np.exp(-decay)
     x_next = np.empty(F.shape[:-1])
-    x_next[..., :2] = x[..., :2] + moved
+    x_next[..., 0], x_next[..., 1] = x[..., 0] + arc * course_x, x[..., 1] + arc * course_y
     x_next[..., 2], x_next[..., 3], x_next[..., 4] = v, wrap(theta + turn), phi * F[..., 4, 4]
     return x_next, F
 
@@ -190,17 +193,20 @@ def bicycle_step(
     where nothing is straightened.
     """
     x, dt = np.asarray(x, dtype=float), np.asarray(dt, dtype=float)
-    density = np.stack(np.broadcast_arrays(np.asarray(sigma_a) ** 2.0, np.asarray(sigma_steer) ** 2.0), axis=-1)
+    by_speed, by_steering = np.asarray(sigma_a) ** 2.0, np.asarray(sigma_steer) ** 2.0
+    density = np.empty((*np.broadcast_shapes(by_speed.shape, by_steering.shape), 2))
+    density[..., 0], density[..., 1] = by_speed, by_steering
     dt = np.broadcast_to(dt, np.broadcast_shapes(x.shape[:-1], dt.shape))
-    left = dt * np.append((1 + NODES) / 2, 1.0).reshape(4, *[1] * dt.ndim)  # when noise strikes, s before the end
+    left = dt * STRIKES.reshape(4, *[1] * dt.ndim)  # when noise strikes, s before the end
     moved, F = bicycle(x, left, wheelbase, straighten)
-    to_end, gained = F[:-1, ..., [2, 4]], wrap(moved[-2::-1, ..., 3] - x[..., 3])  # the nodes are symmetric
+    from_start, gained = F[:-1, ..., 2::2], wrap(moved[-2::-1, ..., 3] - x[..., 3])  # the nodes are symmetric
     c, s = np.cos(gained)[..., None], np.sin(gained)[..., None]
-    along, across = to_end[..., 0, :], to_end[..., 1, :]
-    turned = np.stack([c * along - s * across, s * along + c * across], axis=-2)
-    to_end = np.concatenate([turned, to_end[..., 2:, :]], axis=-2)
+    along, across = from_start[..., 0, :], from_start[..., 1, :]
+    to_end = from_start.copy()
+    to_end[..., 0, :], to_end[..., 1, :] = c * along - s * across, s * along + c * across
     rates = (to_end * density[..., None, :]) @ transpose(to_end)
-    return moved[-1], F[-1], symmetrise(np.tensordot(WEIGHTS / 2, rates, axes=1) * dt[..., None, None])
+    mean_rate = (WEIGHTS / 2 @ rates.reshape(3, -1)).reshape(F.shape[1:])
+    return moved[-1], F[-1], symmetrise(mean_rate * dt[..., None, None])
 
 
 def bicycle_velocity(x: Array) -> tuple[Array, Array]:
@@ -227,9 +233,11 @@ def axes(heading: Array) -> tuple[Array, Array]:
 def sinc(x: Array) -> tuple[Array, Array]:
     """sin(x)/x and its derivative, by series where the quotients would cancel."""
     small = np.abs(x) < 1e-2
-    safe = np.where(small, 1.0, x)
-    value = np.where(small, 1 - x**2 / 6 + x**4 / 120, np.sin(safe) / safe)
-    slope = np.where(small, -x / 3 + x**3 / 30 - x**5 / 840, (safe * np.cos(safe) - np.sin(safe)) / safe**2)
+    value, slope = 1 - x**2 / 6 + x**4 / 120, -x / 3 + x**3 / 30 - x**5 / 840
+    if not small.all():
+        safe = np.where(small, 1.0, x)
+        value = np.where(small, value, np.sin(safe) / safe)
+        slope = np.where(small, slope, (safe * np.cos(safe) - np.sin(safe)) / safe**2)
     return value, slope
 
 

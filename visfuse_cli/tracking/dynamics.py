@@ -260,4 +260,4 @@ def smooth(dynamics: Dynamics, steps: Sequence[Step]) -> Gaussian:
 
 
 def _stacked(beliefs: Sequence[Gaussian]) -> Gaussian:
-    return Gaussian(np.stack([belief.mean for belief in beliefs]), np.stack([belief.cov for belief in beliefs]))
+    return Gaussian(np.array([belief.mean for belief in beliefs]), np.array([belief.cov for belief in beliefs]))

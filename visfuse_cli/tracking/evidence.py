@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Protocol
 
 import cv2
@@ -13,6 +13,7 @@ from visfuse_cli.maths.assignment import assign
 from visfuse_cli.maths.cameras import project
 from visfuse_cli.records import Array, GroundCamera, Image, Region
 from visfuse_cli.tracking.association import overlap, region_boxes
+from visfuse_cli.tracking.elsewhere import HandOver, at_once
 from visfuse_cli.vision import contour, regions, wireframe
 from visfuse_cli.vision.background import FOREGROUND
 from visfuse_cli.vision.contour import Fill, Look, Sight
@@ -53,15 +54,17 @@ class LabelEvidence:
         speck_m: float,
         smallest_m: float,
         grey: Image | None = None,
+        hand_over: HandOver = at_once,
     ) -> None:
         self._labels, self._grey = Labels(labels), grey
+        self._cleaned: Callable[[], regions.Cleaned] | None = hand_over(lambda: regions.cleaned(labels, cut, speck_m))
         self._owned: tuple[bytes, Image] | None = None  # the boxes asked about last, and whose each pixel is
         self._camera, self._cut = camera, cut
-        self._cleaning = gap_m, speck_m, smallest_m
+        self._gap, self._speck, self._smallest = gap_m, speck_m, smallest_m
 
     def pack(self) -> None:
         self._labels.pack()
-        self._grey = self._owned = None
+        self._grey = self._owned = self._cleaned = None
 
     def picture(self) -> Image | None:
         """The grey picture (H, W) of the present frame; None of a past one, or where there is none."""
@@ -93,7 +96,11 @@ class LabelEvidence:
         return contour.fill(self._among(taken), self._camera, pose, size)
 
     def leftovers(self, pose: Array, size: Array) -> list[Region]:
-        found = regions.find(self._labels.picture(), self._cut, *self._cleaning, self._explained(pose, size))
+        if self._cleaned is None:
+            picture = regions.cleaned(self._labels.picture(), self._cut, self._speck)
+        else:
+            picture = self._cleaned()
+        found = regions.find(picture, self._cut, self._gap, self._smallest, self._explained(pose, size))
         lens = self._camera.ground.lens
         return found if lens is None else [regions.undistorted(region, lens) for region in found]
 

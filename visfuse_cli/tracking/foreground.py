@@ -103,7 +103,7 @@ class MovingRegions:
             labels = self._shade.cut(labels, frame.image, self._background.picture, where)
         self._labels = labels
         grey = np.asarray(cv2.cvtColor(frame.image, cv2.COLOR_BGR2GRAY), dtype=np.uint8)
-        return LabelEvidence(labels, self._camera, self._bands, *self._cleaning, grey)
+        return LabelEvidence(labels, self._camera, self._bands, *self._cleaning, grey, self._hand_over)
 
     def learn(self, frame: Frame, tracker: GroundTracker) -> None:
         pose, size = tracker.boxes()

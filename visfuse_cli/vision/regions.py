@@ -16,6 +16,7 @@ from visfuse_cli.vision.lens import undistort_points
 
 BODY_M = 1.1, 0.9  # width and height of what is a vehicle and no part of one
 CAR_M = 4.5, 2.4  # width and height that the parts of one car can span in the picture
+NEIGHBOURS = np.array([(i, j) for i in (-2, 0, 2) for j in (-2, 0, 2)]).T  # (2, 9) px
 LEAST_OPENING_PX = 3  # coding noise along edges of the background comes in specks of two
 
 
@@ -53,28 +54,41 @@ def bands(camera: GroundCamera) -> list[Band]:
     return [Band(int(a), int(b), float(2 ** (octave[a] / 2))) for a, b in zip(starts, ends, strict=True)]
 
 
-def _vehicle_mask(labels: Image, cut: list[Band], gap_m: float, speck_m: float, explained: Image | None) -> Image:
-    """Foreground without specks and what is `explained` (255), its gaps closed up to `gap_m`."""
-    cleaned = np.empty_like(labels)
+@dataclass(frozen=True, slots=True)
+class Cleaned:
+    """A labelled picture without specks: masks (H, W) of paint (255) and of all that moved, shadow included (1)."""
+
+    paint: Image
+    moved: Image
+
+
+def cleaned(labels: Image, cut: list[Band], speck_m: float) -> Cleaned:
+    """Take the specks out of a labelled picture (255 foreground, 127 shadow); they grow with each band's scale."""
+    paint = np.empty_like(labels)
     for band in cut:
         opening = _kernel(max(speck_m * band.scale, LEAST_OPENING_PX))
         top, bottom = max(0, band.top - len(opening)), min(len(labels), band.bottom + len(opening))
         mask = cv2.compare(labels[top:bottom], FOREGROUND, cv2.CMP_EQ)
         mask = cv2.morphologyEx(mask, cv2.MORPH_OPEN, opening)
-        cleaned[band.top : band.bottom] = mask[band.top - top : band.bottom - top]
-    if explained is not None:
-        cv2.subtract(cleaned, explained, cleaned)
-    out = np.zeros_like(labels)
+        paint[band.top : band.bottom] = mask[band.top - top : band.bottom - top]
+    moved = cv2.morphologyEx(cv2.min(labels, 1), cv2.MORPH_OPEN, _kernel(LEAST_OPENING_PX))
+    return Cleaned(paint, np.asarray(moved, dtype=np.uint8))
+
+
+def _closed(paint: Image, cut: list[Band], gap_m: float, explained: Image) -> Image:
+    """What is painted (255) and not `explained` (255), its gaps closed up to `gap_m`."""
+    left_over = np.asarray(cv2.subtract(paint, explained), dtype=np.uint8)
+    out = np.zeros_like(paint)
     for band in cut:
         closing = _kernel(gap_m * band.scale)
         margin = len(closing)
-        top, bottom = max(0, band.top - margin), min(len(labels), band.bottom + margin)
-        left, _, wide, _ = cv2.boundingRect(cleaned[top:bottom])
+        top, bottom = max(0, band.top - margin), min(len(paint), band.bottom + margin)
+        left, _, wide, _ = cv2.boundingRect(left_over[top:bottom])
         across = slice(max(0, left - margin), left + wide + margin)
         if wide:
-            mask = cv2.morphologyEx(cleaned[top:bottom, across], cv2.MORPH_CLOSE, closing)
+            mask = cv2.morphologyEx(left_over[top:bottom, across], cv2.MORPH_CLOSE, closing)
             out[band.top : band.bottom, across] = mask[band.top - top : band.bottom - top]
-    return out if explained is None else cv2.subtract(out, explained)
+    return np.asarray(cv2.subtract(out, explained), dtype=np.uint8)
 
 
 def _kernel(size: float) -> Image:
@@ -82,35 +96,29 @@ def _kernel(size: float) -> Image:
     return np.ones((side, side), np.uint8)
 
 
-def find(
-    labels: Image, cut: list[Band], gap_m: float, speck_m: float, smallest_m: float, explained: Image | None = None
-) -> list[Region]:
-    """Regions of a labelled picture (255 foreground, 127 shadow): connected, at least `smallest_m` tall or wide.
+def find(picture: Cleaned, cut: list[Band], gap_m: float, smallest_m: float, explained: Image) -> list[Region]:
+    """Regions of a labelled picture without specks: connected, at least `smallest_m` tall or wide.
 
     Lengths are metres at each band's scale; hulls run through pixel centres. What is `explained` (255) belongs to no
     region; hull points beside it count as on the border.
     """
-    mask = _vehicle_mask(labels, cut, gap_m, speck_m, explained)
+    mask = _closed(picture.paint, cut, gap_m, explained)
     contours, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
+    contours = [contour for contour in contours if min(cv2.boundingRect(contour)[2:]) >= 2]
     if not contours:
         return []
-    moved = cv2.morphologyEx(cv2.min(labels, 1), cv2.MORPH_OPEN, _kernel(LEAST_OPENING_PX))
-    if explained is not None:
-        cv2.subtract(moved, explained, moved)
-    components = _Components(moved)
+    components = _Components(np.asarray(cv2.subtract(picture.moved, explained), dtype=np.uint8))
     height, width = mask.shape
     scale = np.concatenate([np.full(band.bottom - band.top, band.scale) for band in cut])
+    hulls = [cv2.convexHull(contour).reshape(-1, 2).astype(float) for contour in contours]
+    every = np.concatenate(hulls)
+    ends = np.cumsum([len(hull) for hull in hulls])
+    borders = np.split(at_border(every, (width, height)) | _beside(every, explained), ends[:-1])
     bodies: list[Region] = []
     parts: dict[int, list[tuple[Region, float]]] = {}  # of one moving component: windows, wheels, bumpers
-    for contour in contours:
+    for contour, hull, border in zip(contours, hulls, borders, strict=True):
         x, y, w, h = cv2.boundingRect(contour)
-        if min(w, h) < 2:
-            continue
-        hull = cv2.convexHull(contour).reshape(-1, 2).astype(float)
         box = np.array([x - 0.5, y - 0.5, w, h], dtype=float)
-        border = at_border(hull, (width, height))
-        if explained is not None:
-            border |= _beside(hull, explained)
         area = float(cv2.contourArea(contour))
         number, around, around_area = components.around(contour.reshape(-1, 2)) or (-1, box, area)
         region = Region(box, hull, border, area, around, around_area)
@@ -170,9 +178,8 @@ def at_border(hull: Array, frame_size: tuple[int, int]) -> NDArray[np.bool_]:
 def _beside(hull: Array, explained: Image) -> NDArray[np.bool_]:
     """Which hull points (k, 2) px have something explained next to them."""
     height, width = explained.shape
-    near = hull[:, None].astype(int) + [(i, j) for i in (-2, 0, 2) for j in (-2, 0, 2)]
-    u, v = np.clip(near[..., 0], 0, width - 1), np.clip(near[..., 1], 0, height - 1)
-    return np.asarray(np.any(explained[v, u] > 0, axis=1))
+    u, v = np.clip(hull.astype(int).T[:, None] + NEIGHBOURS[..., None], 0, [[[width - 1]], [[height - 1]]])  # (9, k)
+    return np.asarray((explained[v, u] > 0).any(axis=0))
 
 
 def joined(parts: list[Region]) -> Region:

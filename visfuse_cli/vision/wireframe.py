@@ -20,6 +20,7 @@ DIRECTIONS = 24
 FAN = np.column_stack([np.cos(a := np.arange(DIRECTIONS) * 2 * np.pi / DIRECTIONS), np.sin(a)])  # (K, 2)
 AXES = np.arange(DIRECTIONS) % (DIRECTIONS // 4) == 0  # the four sides of an upright box
 _SIGNS = np.array([[i, j, k] for k in (0, 1) for i in (-1, 1) for j in (-1, 1)], dtype=float)
+_HALF = _SIGNS * [0.5, 0.5, 1.0]  # corners of a box of unit size
 EDGES = np.array([(0, 1), (1, 3), (3, 2), (2, 0), (4, 5), (5, 7), (7, 6), (6, 4), (0, 4), (1, 5), (2, 6), (3, 7)])
 # The faces that meet in each edge: rear, front, right, left, bottom, top.
 _MEET = np.array([(0, 4), (3, 4), (1, 4), (2, 4), (0, 5), (3, 5), (1, 5), (2, 5), (0, 2), (0, 3), (1, 2), (1, 3)])
@@ -80,17 +81,17 @@ class BoxFit:
 
 def corners(pose: Array, size: Array) -> Array:
     """The eight corners (..., 8, 3) m of boxes with pose (..., 3) and size (..., 3); bottom four first."""
-    half = _SIGNS * [0.5, 0.5, 1.0]
-    local = half * size[..., None, :]
+    local = _HALF * size[..., None, :]
     c, s = np.cos(pose[..., 2, None]), np.sin(pose[..., 2, None])
-    x = pose[..., 0, None] + c * local[..., 0] - s * local[..., 1]
-    y = pose[..., 1, None] + s * local[..., 0] + c * local[..., 1]
-    return np.stack([x, y, local[..., 2]], axis=-1)
+    placed = local.copy()
+    placed[..., 0] = pose[..., 0, None] + c * local[..., 0] - s * local[..., 1]
+    placed[..., 1] = pose[..., 1, None] + s * local[..., 0] + c * local[..., 1]
+    return placed
 
 
 def _corner_jacobian(pose: Array, size: Array) -> Array:
     """d corner / d (x, y, theta, l, w, h): (N, 8, 3, 6)."""
-    half = _SIGNS * [0.5, 0.5, 1.0]
+    half = _HALF
     local = half * size[:, None, :]
     c, s = np.cos(pose[:, 2, None]), np.sin(pose[:, 2, None])
     J = np.zeros((len(pose), 8, 3, 6))
@@ -161,23 +162,26 @@ def fit(
     valid, normal = outlines.valid, outlines.normal
     noise = np.asarray(sigma_px, dtype=float)[:, None]
     shares = _corner_shares(outlines)
-    N = np.tile(np.eye(6), (len(x), 1, 1))
-    residual = np.zeros_like(outlines.support)
+    N, residual = np.zeros(0), np.zeros(0)
     for _ in range(iterations):
         pixels, J_pixel = project(camera, corners(x[:, :3], x[:, 3:]))
-        pixels, J_pixel = np.nan_to_num(pixels, nan=-1e9), np.nan_to_num(J_pixel)
+        if not np.isfinite(pixels).all():
+            pixels, J_pixel = np.nan_to_num(pixels, nan=-1e9), np.nan_to_num(J_pixel)
         if outlines.tangent.any():
             outermost = np.argmax(pixels @ normal.swapaxes(1, 2), axis=1)
             shares[outlines.tangent] = np.eye(8)[outermost[outlines.tangent]]
-        residual = outlines.support - np.sum((shares @ pixels) * normal, axis=-1)
+        at = shares @ pixels
+        residual = outlines.support - (at[..., 0] * normal[..., 0] + at[..., 1] * normal[..., 1])
         J_corner = J_pixel @ _corner_jacobian(x[:, :3], x[:, 3:])  # (N, 8, 2, 6)
         J_at = (shares @ J_corner.reshape(len(x), 8, 12)).reshape(*residual.shape, 2, 6)
         J = (normal[:, :, None] @ J_at)[:, :, 0]
         # A Cauchy weight: a mirror, a patch of shadow or a missing corner moves one row, not the box.
         robust = valid / (1 + (residual / (3 * noise)) ** 2) / noise**2
         weighted = (robust[..., None] * J).swapaxes(1, 2)
-        N = weighted @ J + weight[:, :, None] * np.eye(6)
-        N += 1e-9 * np.trace(N, axis1=1, axis2=2)[:, None, None] * np.eye(6)
+        N = weighted @ J
+        diagonal = np.einsum("nii->ni", N)
+        diagonal += weight
+        diagonal += 1e-9 * diagonal.sum(axis=1, keepdims=True)
         gradient = (weighted @ residual[..., None])[..., 0] + weight * (prior - x)
         step = np.linalg.solve(N, gradient[..., None])[..., 0]
         limit = np.minimum(1, 2.0 / np.maximum(np.linalg.norm(step[:, :2], axis=1), 1e-9))
@@ -195,7 +199,7 @@ def fit(
 def _corner_shares(outlines: Outlines) -> Array:
     """How much (N, K, 8) of each corner is in the model points of N outlines."""
     shares = np.zeros((*outlines.share.shape, 8))
-    n, k = np.indices(outlines.share.shape)
+    n, k = np.ix_(*map(range, outlines.share.shape))
     shares[n, k, outlines.corner[..., 0]] = 1 - outlines.share
     shares[n, k, outlines.corner[..., 1]] = outlines.share
     return shares
