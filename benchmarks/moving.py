@@ -275,24 +275,43 @@ def speed(folder: Path, seeds: range) -> None:
 
 
 def memory(folder: Path, seeds: range) -> None:
-    """Peak memory of the whole command, video written, on one clip and on ten times its frames."""
-    print("\nmemory")
-    for seconds in (4.0, 40.0):
+    """Peak memory of the whole command, video and report written, on one clip and on 10 and 40 times its frames."""
+    print("\nmemory, MB")
+    for seconds in (4.0, 40.0, 160.0):
         scene = rendered(folder / f"long{seconds:.0f}", lambda out, seconds=seconds: write_head(lap(seconds), out))
-        with tempfile.TemporaryDirectory() as out:
-            command = [sys.executable, "-m", "visfuse_cli", "-q", "track-imm", str(scene), "--out", out + "/run"]
-            code = "import resource, subprocess, sys; subprocess.run(sys.argv[1:], check=True)\n"
-            code += "print(resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss)"
-            peak = subprocess.run([sys.executable, "-c", code, *command], capture_output=True, text=True, check=True)
-        print(f"{round(15 * seconds)} frames: {int(peak.stdout) / 1024:.0f} MB", flush=True)
+        stereo = peak(scene, "--set", "odometry.wheel_separation=0.4")
+        ground = surveyed(folder / f"gazelong{seconds:.0f}", watched(seconds), 0.0)
+        pan_tilt = peak(ground, "--config", "pan-tilt", "--set", "target.height=0.85")
+        print(f"{round(15 * seconds)} frames: {stereo:.1f} stereo, {pan_tilt:.1f} pan-tilt", flush=True)
+
+
+def peak(scene: Path, *options: str) -> float:
+    """MB that a run takes at most."""
+    with tempfile.TemporaryDirectory() as out:
+        command = [sys.executable, "-m", "visfuse_cli", "-q", "track-imm", str(scene), "--out", out + "/run", *options]
+        code = "import resource, subprocess, sys; subprocess.run(sys.argv[1:], check=True)\n"
+        code += "print(resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss)"
+        done = subprocess.run([sys.executable, "-c", code, *command], capture_output=True, text=True, check=True)
+    return int(done.stdout) / 1024
 
 
 def lap(seconds: float) -> HeadScene:
     """Somebody who walks to and fro before a head that turns to and fro."""
-    t = np.arange(0, seconds + 2, 0.5)
-    places = np.column_stack([np.sin(0.8 * t), 4.5 + 0.3 * np.cos(0.5 * t)])
     scene = room(3, still=True, seconds=seconds)
-    return replace(scene, walks=(Walk(t, places, 30),), speed=(0.0, 0.05), turn=(0.0, 0.05, 4.0))
+    return replace(scene, walks=(strolling(seconds, 4.5),), speed=(0.0, 0.05), turn=(0.0, 0.05, 4.0))
+
+
+def watched(seconds: float) -> GazeScene:
+    """Somebody who walks to and fro before a pan-tilt head that follows, at the frame rate of the stereo head."""
+    scene = yard(3, size=(256, 192))
+    frames = round(15 * seconds)
+    return replace(scene, walks=(strolling(seconds, 9.0),), fps=Fraction(15), n_frames=frames)
+
+
+def strolling(seconds: float, away: float) -> Walk:
+    """A walk to and fro, `away` m off."""
+    t = np.arange(0, seconds + 2, 0.5)
+    return Walk(t, np.column_stack([np.sin(0.8 * t), away + 0.3 * np.cos(0.5 * t)]), 30)
 
 
 if __name__ == "__main__":

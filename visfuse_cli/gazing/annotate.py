@@ -8,43 +8,45 @@ import cv2
 import numpy as np
 
 from visfuse_cli.gazing.head import Head
-from visfuse_cli.moving.annotate import SHARE, UNITS, WHITE
+from visfuse_cli.moving.annotate import OUT_OF_SIGHT, SHARE, UNITS, WHITE
 from visfuse_cli.moving.settings import ImmConfig
 from visfuse_cli.records import Array, Image
 from visfuse_cli.vision import drawing
 
 TRAIL_S = 2.0
+UNTOLD = {"position": [np.nan] * 2}
 
 
 class Drawn:
-    """One settled track of tracks.json, ready to be drawn."""
+    """What is drawn of one settled track of tracks.json."""
 
     def __init__(self, record: dict[str, Any], head: Head, config: ImmConfig) -> None:
-        self._states = {int(state["frame"]): state for state in record["states"]}
         self.id, self._head = int(record["id"]), head
         self._height, self._units = config.target.height or 0.0, config.display.units
-        self.frames = np.array([state["frame"] for state in record["states"]])
-        self.places = np.array([state["position"] for state in record["states"]])
-        self._t = np.array([state["t"] for state in record["states"]])
+        self.frames, self.places, self._t, self._speeds, self._measured = (
+            np.array([state[name] for state in record["states"]])
+            for name in ("frame", "position", "t", "speed", "measured")
+        )
+        self._boxes = np.array([state["box"].get("left", OUT_OF_SIGHT) for state in record["states"]])
+        self._ahead = np.array([state.get("ahead", UNTOLD)["position"] for state in record["states"]])
         self.colour = drawing.colour_of(self.id)
 
     def draw(self, picture: Image, frame: int, gaze: Array) -> None:
         """Draw one frame: the box, the way so far, the estimate in white, and where it will be a latency later."""
-        state = self._states.get(frame)
-        if state is None:
-            return
         k = int(np.searchsorted(self.frames, frame))
+        if k == len(self.frames) or self.frames[k] != frame:
+            return
         begin = int(np.searchsorted(self._t, self._t[k] - TRAIL_S))
         drawing.polyline(picture, self._seen(self.places[begin : k + 1], 0.0, gaze), self.colour)
-        x, y, w, h = state["box"]["left"]
-        if state["measured"]:
+        x, y, w, h = self._boxes[k]
+        if self._measured[k]:
             corners = np.array([[x, y], [x + w, y], [x + w, y + h], [x, y + h]])
             drawing.polyline(picture, corners, self.colour, closed=True)
         _cross(picture, self._seen(self.places[k : k + 1], self._height, gaze)[0], WHITE)
-        if "ahead" in state:
-            _cross(picture, self._seen(np.array([state["ahead"]["position"]]), self._height, gaze)[0], self.colour)
-        text = f"{self.id}  {state['speed'] * UNITS[self._units]:.1f} {self._units}"
-        drawing.label(picture, text, np.array([x, y - 4.0]), self.colour)
+        _cross(picture, self._seen(self._ahead[k : k + 1], self._height, gaze)[0], self.colour)
+        if np.isfinite([x, y]).all():
+            text = f"{self.id}  {self._speeds[k] * UNITS[self._units]:.1f} {self._units}"
+            drawing.label(picture, text, np.array([x, y - 4.0]), self.colour)
 
     def _seen(self, places: Array, height: float, gaze: Array) -> Array:
         return self._head.pixels(np.column_stack([places, np.full(len(places), height)]), gaze)

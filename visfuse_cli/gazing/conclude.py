@@ -110,7 +110,7 @@ def _states(target: Target, whole: _Part) -> Iterator[dict[str, Any]]:
             "covariance": symmetrise(cov).tolist(),
             "speed": speed,
             "speed_sigma": float(np.sqrt(max(float(unit @ cov[2:, 2:] @ unit), 0.0))),
-            "box": {"left": seen["box"].tolist()},
+            "box": {"left": seen["box"].tolist()} if np.isfinite(seen["box"]).all() else {},
             "measured": bool(np.isfinite(seen["z"][0])),
         }
         if len(names) > 1:

@@ -15,25 +15,30 @@ from visfuse_cli.vision import drawing
 UNITS = {"km/h": 3.6, "mph": 2.2369362920544, "m/s": 1.0}
 SHARE = 0.3  # of the picture's height: side of the map
 WHITE = (255, 255, 255)
+OUT_OF_SIGHT = [np.nan] * 4
 
 
 class Drawn:
-    """One settled track of tracks.json, ready to be drawn."""
+    """What is drawn of one settled track of tracks.json."""
 
-    def __init__(self, record: dict[str, Any], size: Array, units: str) -> None:
+    def __init__(self, record: dict[str, Any], units: str) -> None:
         self.id = int(record["id"])
-        self._states = {int(state["frame"]): state for state in record["states"]}
-        self.frames = np.array([state["frame"] for state in record["states"]])
-        self.places = np.array([state["position"] for state in record["states"]])
-        self._size, self._units = size, units
+        self.frames, self.places, self._speeds, self._measured = (
+            np.array([state[name] for state in record["states"]]) for name in ("frame", "position", "speed", "measured")
+        )
+        self._boxes = {
+            view: np.array([state["box"].get(view, OUT_OF_SIGHT) for state in record["states"]])
+            for view in ("left", "right")
+        }
+        self._size, self._units = np.array(record["summary"]["size"]), units
         self.colour = drawing.colour_of(self.id)
 
     def draw(self, pictures: dict[str, Image], frame: int, rig: StereoRig, head: Head) -> None:
         """Draw one frame: the box as it was measured, and in white the one that the 3D estimate projects to."""
-        state = self._states.get(frame)
-        if state is None:
+        k = int(np.searchsorted(self.frames, frame))
+        if k == len(self.frames) or self.frames[k] != frame:
             return
-        place = head.inside(np.array(state["position"]))
+        place = head.inside(self.places[k])
         half = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]) / 2 * [*self._size, 0]
         for view, image in pictures.items():
             if place[2] > 0.2:
@@ -41,11 +46,10 @@ class Drawn:
                 shown = corners if view == "left" else in_right(rig, corners)
                 lens = rig.left if view == "left" else rig.right
                 drawing.polyline(image, projected(lens.K, shown), WHITE, closed=True)
-            box = state["box"].get(view)
-            if box is not None and state["measured"]:
-                x, y, w, h = box
+            x, y, w, h = box = self._boxes[view][k]
+            if self._measured[k] and np.isfinite(box).all():
                 drawing.polyline(image, np.array([[x, y], [x + w, y], [x + w, y + h], [x, y + h]]), self.colour, True)
-                text = f"{self.id}  {state['speed'] * UNITS[self._units]:.1f} {self._units}"
+                text = f"{self.id}  {self._speeds[k] * UNITS[self._units]:.1f} {self._units}"
                 drawing.label(image, text, np.array([x, y - 4.0]), self.colour)
 
 

@@ -12,6 +12,7 @@ import numpy as np
 
 from visfuse_cli.errors import InputError
 from visfuse_cli.files.lanes_file import read_lanes
+from visfuse_cli.files.spool import without_covariance
 from visfuse_cli.maths.polygons import Polygon
 from visfuse_cli.records import Array
 
@@ -81,7 +82,7 @@ def read(folder: Path) -> RunView:
 
 def _json(path: Path) -> dict[str, Any]:
     try:
-        document = json.loads(path.read_text(encoding="utf-8"))
+        document = json.loads(path.read_text(encoding="utf-8"), object_hook=without_covariance)
     except (OSError, ValueError, RecursionError) as problem:
         raise InputError(f"{path}: cannot be read: {problem}") from problem
     if not isinstance(document, dict):

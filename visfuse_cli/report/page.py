@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import json
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -14,13 +14,14 @@ import numpy as np
 from jinja2 import Environment, PackageLoader, select_autoescape
 
 from visfuse_cli import __version__
-from visfuse_cli.files.atomic import write_text
+from visfuse_cli.files.atomic import replacing
 from visfuse_cli.files.video_writer import begin_of
 from visfuse_cli.maths.consistency import innovations
 from visfuse_cli.report import calibration, plots, tables
 from visfuse_cli.report.folder import RunView, TrackView, read
 
 EMBEDDED_BYTES = 30_000_000  # of the videos of one run; what goes beyond is linked, beside the page
+PIECE = 3 << 16  # bytes of a file that are turned to text at once; by threes, so that the texts go on
 MAP_HZ = 12.5  # of positions on the map
 NAME = "report.html"
 STEREO_FRAME = "left-camera"  # of positions of a pair that stands still: depth is their third number
@@ -46,10 +47,11 @@ def write(folders: Sequence[Path], out: Path | None = None) -> Path:
     )
     here = resources.files("visfuse_cli.report")
     style, script = ((here / name).read_text(encoding="utf-8") for name in ("style.css", "script.js"))
-    text = environment.get_template("template.html").render(
+    pieces = environment.get_template("template.html").generate(
         runs=runs, version=__version__, style=style, script=script, model_colours=plots.MODELS
     )
-    write_text(page, text)
+    with replacing(page, "w") as file:
+        file.writelines(pieces)
     return page
 
 
@@ -61,7 +63,7 @@ def _page_of(folders: Sequence[Path]) -> Path:
 
 def _calibration(number: int, path: Path) -> dict[str, Any]:
     shown = calibration.section(path)
-    picture = _data_uri(shown["picture"], "image/png") if shown["picture"] else ""
+    picture = _data_uri(shown["picture"], "image/png") if shown["picture"] else []
     return shown | {"key": f"run{number}", "document": {"command": "calibrate-homography"}, "calibration": picture}
 
 
@@ -88,7 +90,7 @@ def _section(number: int, run: RunView, page: Path) -> dict[str, Any]:
         "depths": plots.depths(accepted) if run.frame_of_reference == STEREO_FRAME else [],
         "models": plots.models(accepted),
         "consistency": _consistency(accepted),
-        "calibration": _data_uri(run.calibration, "image/png") if run.calibration else "",
+        "calibration": _data_uri(run.calibration, "image/png") if run.calibration else [],
         "warnings": document.get("warnings", []),
         "config": json.dumps(document.get("config", {}), indent=2, ensure_ascii=False),
         "data": _map_data(run),
@@ -121,14 +123,18 @@ def _videos(run: RunView, page: Path) -> list[dict[str, Any]]:
         here = os.path.relpath(path.resolve(), page.resolve().parent)
         fits = size <= left
         left -= size if fits else 0
-        source = _data_uri(path, "video/mp4") if fits else here
+        source = _data_uri(path, "video/mp4") if fits else [here]
         begin = begin_of(path)
         videos.append({"name": name, "source": source, "linked": "" if fits else here, "begin": begin})
     return videos
 
 
-def _data_uri(path: Path, kind: str) -> str:
-    return f"data:{kind};base64,{base64.b64encode(path.read_bytes()).decode()}"
+def _data_uri(path: Path, kind: str) -> Iterator[str]:
+    """A file as an address, piece by piece: no video is held whole."""
+    yield f"data:{kind};base64,"
+    with open(path, "rb") as file:
+        while piece := file.read(PIECE):
+            yield base64.b64encode(piece).decode()
 
 
 def _map_data(run: RunView) -> str:

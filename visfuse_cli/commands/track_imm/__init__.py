@@ -50,7 +50,7 @@ def run(request: RunRequest) -> RunResult:
         tracks.sort(key=lambda track: track["id"])
         audits = _audit(head, sources, run_)
         if request.video and run_.stopped_by is None:
-            records = [spool.read(track["id"]) for track in tracks]
+            records = (spool.read(track["id"]) for track in tracks)
             head.draw(open_views(head.views, request), records, folder / "annotated.mp4", run_)
         brief, own = head.extra()
         summary = {"targets": len(tracks), "tracks": tracks, "frames": run_.counts["frames"]} | brief

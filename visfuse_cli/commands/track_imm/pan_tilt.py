@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -96,7 +96,7 @@ class PanTiltRun:
         """What the summary and run.json hold besides."""
         return {}, {"head": {"position": self._rest.centre.tolist()}}
 
-    def draw(self, sources: dict[str, VideoSource], records: list[dict[str, Any]], path: Path, run_: Run) -> None:
+    def draw(self, sources: dict[str, VideoSource], records: Iterable[dict[str, Any]], path: Path, run_: Run) -> None:
         """Write the view with a map of the ground, from a second decode."""
         tracks = [Drawn(record, self._rest, self._config) for record in records]
         wide, high = self._size[0] // 2 * 2, self._size[1] // 2 * 2

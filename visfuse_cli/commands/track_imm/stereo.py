@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -107,10 +107,9 @@ class StereoRun:
         }
         return {"ego_distance": driven}, {"ego": ego}
 
-    def draw(self, sources: dict[str, VideoSource], records: list[dict[str, Any]], path: Path, run_: Run) -> None:
+    def draw(self, sources: dict[str, VideoSource], records: Iterable[dict[str, Any]], path: Path, run_: Run) -> None:
         """Write both views side by side with a map, from a second decode."""
-        units = self._config.display.units
-        tracks = [Drawn(record, np.array(record["summary"]["size"]), units) for record in records]
+        tracks = [Drawn(record, self._config.display.units) for record in records]
         ego = self._ride.kept()
         wide, high = 2 * (self._size[0] // 2 * 2), self._size[1] // 2 * 2
         rate = sources["left"].nominal_rate
