@@ -35,6 +35,9 @@ class Evidence(Protocol):
     def probe(self, pose: Array, size: Array, reach: Array, taken: Boxes) -> Look:
         """Look for each of N boxes as if it alone stood among those `taken`."""
 
+    def outlines(self, pose: Array, size: Array, reach: Array, taken: Boxes) -> Outlines:
+        """The outlines that `probe` finds, and nothing else."""
+
     def leftovers(self, pose: Array, size: Array) -> list[Region]:
         """Regions that the N boxes do not explain."""
 
@@ -75,6 +78,10 @@ class LabelEvidence:
 
     def probe(self, pose: Array, size: Array, reach: Array, taken: Boxes) -> Look:
         return contour.search([self._among(taken)], np.zeros(len(pose), int), self._camera, pose, size, reach)
+
+    def outlines(self, pose: Array, size: Array, reach: Array, taken: Boxes) -> Outlines:
+        nobody = np.zeros(len(pose), int)
+        return contour.profiles([self._among(taken)], nobody, self._camera, pose, size, reach).outlines
 
     @staticmethod
     def probe_each(frames: Sequence[LabelEvidence], pose: Array, size: Array, reach: Array, taken: list[Boxes]) -> Look:
@@ -147,6 +154,9 @@ class BoxEvidence:
                     seen[thing] = self._sides(best)
                     share[thing] = 1.0
         return Look(Outlines.stack(seen), share, share, share, share, share, share, share)
+
+    def outlines(self, pose: Array, size: Array, reach: Array, taken: Boxes) -> Outlines:
+        return self.probe(pose, size, reach, taken).outlines
 
     def pack(self) -> None:
         """A few boxes are little."""

@@ -16,6 +16,7 @@ from visfuse_cli.tracking.evidence import Boxes, Evidence
 from visfuse_cli.tracking.settings import SizePrior, TrackerSettings
 from visfuse_cli.vision import wireframe
 from visfuse_cli.vision.contour import Look
+from visfuse_cli.vision.wireframe import BoxFit
 
 REACHES_PX = (24.0, 12.0, 6.0)  # how far around a hypothesis its border is looked for, coarse to fine
 BORDER_SEEN, AREA_MOVED = 0.6, 0.6  # shares of its border and its area that must be found
@@ -79,10 +80,13 @@ def refined(
     priors = [measure.prior_arrays(prior) for prior in classes]
     mean, sigma = (np.stack([pair[k] for pair in priors])[which] for k in (0, 1))
     size = mean
-    for reach in REACHES_PX:
-        look = evidence.probe(pose, size, np.full(len(pose), reach), taken)
-        fit = measure.fit_poses(camera, look.outlines, pose, mean, sigma, settings.pose, HEADING_SIGMA)
-        pose, size = np.where(fit.ok[:, None], fit.pose, pose), np.where(fit.ok[:, None], fit.size, size)
+    for reach in REACHES_PX[:-1]:
+        outlines = evidence.outlines(pose, size, np.full(len(pose), reach), taken)
+        fit = measure.fit_poses(camera, outlines, pose, mean, sigma, settings.pose, HEADING_SIGMA)
+        pose, size = _moved(fit, pose, size)
+    look = evidence.probe(pose, size, np.full(len(pose), REACHES_PX[-1]), taken)
+    fit = measure.fit_poses(camera, look.outlines, pose, mean, sigma, settings.pose, HEADING_SIGMA)
+    pose, size = _moved(fit, pose, size)
     usual = np.all(np.abs(size - mean) < UNUSUAL * sigma, axis=1)
     area = area_of(camera, pose, size) * look.open
     # A window of a grey car looks like a small vehicle: what explains little of all that moves must be seen clearly.
@@ -100,6 +104,11 @@ def refined(
     good &= gain > 0
     gain = gain * np.exp(-USUAL_WEIGHT * np.sum(((size - mean) / sigma) ** 2, axis=1))
     return [Guess(classes[which[k]], pose[k], size[k], sigma[k], float(gain[k])) for k in np.flatnonzero(good)]
+
+
+def _moved(fit: BoxFit, pose: Array, size: Array) -> tuple[Array, Array]:
+    """Poses and sizes (N, 3) after a fit, as they were where it failed."""
+    return np.where(fit.ok[:, None], fit.pose, pose), np.where(fit.ok[:, None], fit.size, size)
 
 
 def gain_of(camera: GroundCamera, evidence: Evidence, pose: Array, size: Array, taken: Boxes) -> float:

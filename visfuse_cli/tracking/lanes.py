@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
-from scipy.signal import find_peaks
 
 from visfuse_cli.config import Section
 from visfuse_cli.maths.polygons import Polygon, contains
@@ -140,7 +139,8 @@ def _middles(offset: Array, settings: LaneSettings) -> tuple[Array, NDArray[np.i
     one's."""
     grid = np.arange(offset.min() - 2, offset.max() + 2, GRID_M)
     density = np.exp(-(((grid[:, None] - offset) / SPREAD_M) ** 2) / 2).sum(axis=1)
-    peaks, _ = find_peaks(density)
+    inner = density[1:-1]
+    peaks = 1 + np.flatnonzero((inner > density[:-2]) & (inner >= density[2:]))
     kept = [int(peaks[0])] if len(peaks) else []
     for peak in peaks[1:]:
         valley = float(density[kept[-1] : peak].min())

@@ -90,23 +90,39 @@ class Sight:
     owner: Image
 
 
-def search(
+@dataclass(frozen=True, slots=True)
+class Profiles:
+    """What was seen across the borders of N boxes: the outlines, and of the K profiles of each (N, K, S) what is known
+    and what is paint; which end on the ground (N, K), and which have background outside, not shadow or paint (N, K).
+
+    `middle` (2, N, 1), `at` and `normal` (2, N, K) are the places, px, as in `_places`.
+    """
+
+    outlines: Outlines
+    middle: Array
+    at: Array
+    normal: Array
+    known: NDArray[np.bool_]
+    paint: NDArray[np.bool_]
+    ground: NDArray[np.bool_]
+    clear: NDArray[np.bool_]
+
+
+def profiles(
     sights: Sequence[Sight], code: NDArray[np.intp], camera: GroundCamera, pose: Array, size: Array, reach: Array
-) -> Look:
+) -> Profiles:
     """Look for the outlines of N boxes with pose (N, 3) and size (N, 3), at most `reach` (N,) px off.
 
     All of them are looked for in one of `sights`, or each in its own; `code` (N,) is what the boxes are called among
     the owners there, 0 when they are not.
     """
-    count = len(pose)
     middle, at, normal, edge, share, total = _places(camera, pose, size)
     offset = reach[:, None] * np.linspace(-1, 1, 2 * STEPS + 1)  # (N, S)
     along = at[..., None] + normal[..., None] * offset[:, None]  # (2, N, K, S)
     label, whose, inside = _look(sights, camera, along)
     known = inside & ((whose == 0) | (whose == code[:, None, None]))
     paint = known & (label == FOREGROUND)
-    # shadow is outside, or it is grey paint
-    found = np.stack([_border(known, moved, offset) for moved in (paint, known & (label > 0))])
+    found = _border(known, np.stack([paint, known & (label > 0)]), offset)  # shadow is outside, or it is grey paint
     nearest = np.where(np.abs(found[1]) < np.abs(np.nan_to_num(found[0], nan=np.inf)), found[1], found[0])
     ground = edge < GROUND_EDGES
     under = _stands_in_shadow(paint, known, offset, found, ground)
@@ -114,22 +130,30 @@ def search(
     valid = np.isfinite(nearest)
     support = _dot(normal, at) + np.nan_to_num(nearest)
     rows = np.ascontiguousarray(np.moveaxis(normal, 0, -1))
-    outlines = Outlines(rows, support, EDGES[edge], share, valid, np.zeros(count, dtype=bool), total / np.pi)
-
-    seen = np.count_nonzero(known, axis=2)
-    in_view = seen / known.shape[2] > OPEN
-    amidst = np.count_nonzero(paint, axis=2) > SOLID * seen  # nothing but paint: another vehicle is beside this one
-    told = in_view & (valid | ~amidst)
-    label, whose, inside = _look(sights, camera, _spokes(middle, at, _RADII))
-    own = inside & (whose == code[:, None, None])
-    area = _areas(middle, at, normal)[..., None] * np.ones(len(_RADII))
-    area /= np.maximum(area.sum(axis=(1, 2), keepdims=True), 1e-9)
+    outlines = Outlines(rows, support, EDGES[edge], share, valid, np.zeros(len(pose), dtype=bool), total / np.pi)
     clear = valid & (under | (np.abs(found[1] - nearest) < CLEAR_PX))
+    return Profiles(outlines, middle, at, normal, known, paint, ground, clear)
+
+
+def search(
+    sights: Sequence[Sight], code: NDArray[np.intp], camera: GroundCamera, pose: Array, size: Array, reach: Array
+) -> Look:
+    """What is seen of N boxes: outlines as in `profiles`, and how much of border and area is as it was expected."""
+    across = profiles(sights, code, camera, pose, size, reach)
+    valid, ground = across.outlines.valid, across.ground
+    seen = np.count_nonzero(across.known, axis=2)
+    in_view = seen / across.known.shape[2] > OPEN
+    amidst = np.count_nonzero(across.paint, axis=2) > SOLID * seen  # nothing but paint: another vehicle is beside it
+    told = in_view & (valid | ~amidst)
+    label, whose, inside = _look(sights, camera, _spokes(across.middle, across.at, _RADII))
+    own = inside & (whose == code[:, None, None])
+    area = _areas(across.middle, across.at, across.normal)[..., None] * np.ones(len(_RADII))
+    area /= np.maximum(area.sum(axis=(1, 2), keepdims=True), 1e-9)
     return Look(
-        outlines,
+        across.outlines,
         border=_share(valid & in_view, in_view, 1 / DIRECTIONS),
         likeness=_share(valid & in_view, told, 1 / DIRECTIONS),
-        clear=_share(clear, valid, 1 / DIRECTIONS),
+        clear=_share(across.clear, valid, 1 / DIRECTIONS),
         foot=_share(valid & in_view & ground, in_view & ground, 1 / DIRECTIONS),
         moved=_share(own & (label > 0), own, area),
         paint=_share(own & (label == FOREGROUND), own, area),
@@ -254,21 +278,21 @@ def _look(sights: Sequence[Sight], camera: GroundCamera, points: Array) -> tuple
     return label, whose, inside
 
 
-def _border(known: np.ndarray, moved: np.ndarray, offset: Array) -> Array:
-    """Where (N, K) px, along profiles (N, K, S) that are `known` and, of these, `moved`, the border lies; NaN: nowhere.
+def _border(known: NDArray[np.bool_], moved: NDArray[np.bool_], offset: Array) -> Array:
+    """Where (M, N, K) px, along profiles (N, K, S) at offsets (N, S) px, the border lies; NaN: nowhere.
 
-    Each place votes +1 for inside where it moved, -1 for outside, and not at all where it is not known.
+    Of what is `known` (N, K, S) each of M ways to look says what `moved` (M, N, K, S). A place votes +1 for inside
+    where it moved, -1 for outside where not, and not at all where it is not known.
     """
     votes = 2 * moved.view(np.int8) - known.view(np.int8)
-    total = np.cumsum(votes, axis=2, dtype=np.int8)  # of fewer than 2 * STEPS + 2 places
-    before = total[:, :, SURE - 1 :].copy()
-    before[:, :, 1:] -= total[:, :, :-SURE]  # sums of SURE places that end here
-    first, last = SURE - 1, total.shape[2] - SURE - 1  # a border lies after place c, first <= c <= last
-    inner = before[:, :, : last - first + 1]
-    outer = before[:, :, SURE : SURE + last - first + 1]
+    total = np.cumsum(votes, axis=-1, dtype=np.int8)  # of fewer than 2 * STEPS + 2 places
+    before = total[..., SURE - 1 :].copy()
+    before[..., 1:] -= total[..., :-SURE]  # sums of SURE places that end here
+    first, last = SURE - 1, total.shape[-1] - SURE - 1  # a border lies after place c, first <= c <= last
+    inner = before[..., : last - first + 1]
+    outer = before[..., SURE : SURE + last - first + 1]
     sure = (inner >= SURE // 2) & (outer <= -SURE // 2)
-    split = np.where(sure, 2 * total[:, :, first : last + 1] - total[:, :, -1:], np.int8(NOWHERE))
-    best = np.argmax(split, axis=2)
-    found = np.take_along_axis(split, best[..., None], axis=2)[..., 0] > NOWHERE
+    split = np.where(sure, 2 * total[..., first : last + 1] - total[..., -1:], np.int8(NOWHERE))
     middle = (offset[:, first : last + 1] + offset[:, first + 1 : last + 2]) / 2
-    return np.where(found, np.take_along_axis(middle, best, axis=1), np.nan)
+    there = middle[np.arange(len(middle))[:, None], np.argmax(split, axis=-1)]
+    return np.where(sure.any(axis=-1), there, np.nan)

@@ -174,7 +174,7 @@ def fit(
         residual = outlines.support - (at[..., 0] * normal[..., 0] + at[..., 1] * normal[..., 1])
         J_corner = J_pixel @ _corner_jacobian(x[:, :3], x[:, 3:])  # (N, 8, 2, 6)
         J_at = (shares @ J_corner.reshape(len(x), 8, 12)).reshape(*residual.shape, 2, 6)
-        J = (normal[:, :, None] @ J_at)[:, :, 0]
+        J = normal[..., :1] * J_at[..., 0, :] + normal[..., 1:] * J_at[..., 1, :]
         # A Cauchy weight: a mirror, a patch of shadow or a missing corner moves one row, not the box.
         robust = valid / (1 + (residual / (3 * noise)) ** 2) / noise**2
         weighted = (robust[..., None] * J).swapaxes(1, 2)
