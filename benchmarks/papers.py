@@ -6,37 +6,26 @@ drawn from fixed seeds.
 
 from __future__ import annotations
 
-import argparse
 import sys
-from collections.abc import Callable
 from pathlib import Path
 
 from scipy.stats import chi2
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from benchmarks import bradshaw, jia, lou, pursuit
+from benchmarks import bradshaw, choice, jia, lou, pursuit
 from tests.test_fusion import simulate
 
 
 def main() -> None:
-    tables: dict[str, Callable[[int], None]] = {
+    tables = {
         "bradshaw": bradshaw.tables,
         "latency": pursuit.prediction_over_latency,
         "jia": jia.people_straight_and_turning,
         "lou": lou.cars,
         "wu": cameras,
     }
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("tables", nargs="*", metavar="table", help=f"of {', '.join(tables)}; all without one")
-    parser.add_argument("--runs", type=int, default=100)
-    args = parser.parse_args()
-    unknown = sorted(set(args.tables) - set(tables))
-    if unknown:
-        parser.error(f"no table {unknown[0]}; there are {', '.join(tables)}")
-    for name in args.tables or tables:
-        tables[name](args.runs)
-        print()
+    choice.run(__doc__, tables, "--runs", 100)
 
 
 def cameras(runs: int) -> None:

@@ -6,7 +6,6 @@ tables I and II with the causal filter, as the paper has it.
 
 from __future__ import annotations
 
-import argparse
 import hashlib
 import json
 import subprocess
@@ -21,6 +20,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
+from benchmarks import choice
 from samples.passing import MPH, PassScene, straight_pass, write_pass
 from visfuse_cli.commands.track_stereo_pf import run
 from visfuse_cli.facing.settings import StereoConfig
@@ -45,15 +45,7 @@ def main() -> None:
         "memory": lambda n: memory(),
         "speed": lambda n: speed(),
     }
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("tables", nargs="*", metavar="table", help=f"of {', '.join(tables)}; all without one")
-    parser.add_argument("--seeds", type=int, default=20)
-    args = parser.parse_args()
-    unknown = sorted(set(args.tables) - set(tables))
-    if unknown:
-        parser.error(f"no table {unknown[0]}; there are {', '.join(tables)}")
-    for name in args.tables or tables:
-        tables[name](args.seeds)
+    choice.run(__doc__, tables, "--seeds", 20)
 
 
 def noises(seeds: int) -> None:

@@ -9,7 +9,7 @@ import sys
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
@@ -21,7 +21,10 @@ from typing import Any, Protocol, TypeVar
 import cv2
 from tqdm import tqdm
 
+from visfuse_cli.files.folders import paths_of
 from visfuse_cli.files.run_json import write_run_json
+from visfuse_cli.files.runfolder import RunFolder
+from visfuse_cli.files.spool import TrackSpool
 from visfuse_cli.files.video import VideoSource
 from visfuse_cli.records import Frame, FrameSet, RunRequest, TimeAudit
 from visfuse_cli.threads import thread_cap
@@ -204,6 +207,19 @@ class Run:
 
     def _bar(self, total: int | None) -> Any:
         return tqdm(total=total, unit=" frames", file=sys.stderr, disable=not self.progress, leave=False)
+
+
+@contextmanager
+def opened(
+    request: RunRequest, inputs: Iterable[dict[str, Any]], frame_of_reference: str
+) -> Iterator[tuple[Path, Run, TrackSpool]]:
+    """One run and what it writes to: its folder, held and cleared, and tracks.json. `inputs` are as described."""
+    with (
+        RunFolder(request.out, request.overwrite, inputs=[request.input, *paths_of(inputs)]) as folder,
+        Run(request.progress) as run,
+        TrackSpool(folder, request.command, request.seed, frame_of_reference) as spool,
+    ):
+        yield folder, run, spool
 
 
 def _instants(

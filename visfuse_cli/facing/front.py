@@ -10,13 +10,14 @@ from visfuse_cli.facing import free
 from visfuse_cli.facing.settings import StereoConfig
 from visfuse_cli.maths import particles
 from visfuse_cli.maths.paths import Way
-from visfuse_cli.maths.planes import in_right, on_plane, projected
+from visfuse_cli.maths.planes import in_right, on_plane, projected, triangulated
 from visfuse_cli.records import Array, Gaussian, StereoRig
 from visfuse_cli.vision import patches
 from visfuse_cli.vision.patches import Grey, Template
 from visfuse_cli.vision.pieces import Pieces, Seen
 
 S, V, LATERAL, VERTICAL, SIZE = range(5)  # of a state: arc length m, speed m/s, drift m, log size
+NEAREST = 0.1  # m before the cameras
 FACING, FACING_FOUND = 0.4, 0.97  # cosines of the way to the line of sight from which on its front is seen
 
 
@@ -38,6 +39,12 @@ def middle(way: Way, states: Array) -> Array:
     """The front's middle (..., 3) m of states (..., 5)."""
     point, axes = way.frame(states[..., S])
     return np.asarray(point + states[..., LATERAL, None] * axes[..., 1] + states[..., VERTICAL, None] * axes[..., 2])
+
+
+def place_of(rig: StereoRig, left: Array, right: Array) -> Array | None:
+    """Where (3,) m the middle of a front in both quads (4, 2) px is; None where that is not before the cameras."""
+    place = triangulated(rig, left.mean(axis=0), right.mean(axis=0))
+    return place if np.isfinite(place).all() and place[2] > NEAREST else None
 
 
 def shape_of(rig: StereoRig, way: Way, quad: Array, depth: float, facing: float) -> tuple[Shape, Array]:

@@ -5,12 +5,22 @@ from __future__ import annotations
 import numpy as np
 
 from visfuse_cli.facing import cloud, free
-from visfuse_cli.facing.front import FACING, FACING_FOUND, Shape, Target, corners, middle, quads_of, shape_of
+from visfuse_cli.facing.front import (
+    FACING,
+    FACING_FOUND,
+    Shape,
+    Target,
+    corners,
+    middle,
+    place_of,
+    quads_of,
+    shape_of,
+)
 from visfuse_cli.facing.look import look, measured, moved_across, take_over
 from visfuse_cli.facing.settings import StereoConfig
 from visfuse_cli.maths import particles
 from visfuse_cli.maths.paths import Way
-from visfuse_cli.maths.planes import in_right, projected, triangulated
+from visfuse_cli.maths.planes import in_right, projected
 from visfuse_cli.records import Array, StereoRig
 from visfuse_cli.vision import patches
 from visfuse_cli.vision.patches import Alignment, Grey
@@ -38,22 +48,18 @@ def start(
     """
     (left, right), given = quads, doubt is None
     right = moved_across(views, left, right)
-    place = triangulated(rig, left.mean(axis=0), right.mean(axis=0))
-    if not np.isfinite(place).all() or place[2] <= 0.1:
+    place = place_of(rig, left, right)
+    if place is None:
         return None
-    shape, state = shape_of(rig, way, left, float(place[2]), FACING if given else FACING_FOUND)
     rng = np.random.default_rng((seed, identity))
-    count, unbound = config.filter.particles, not config.filter.path_constraint
-    depth = cloud.depths(rig, float(place[2]), count, rng)
-    speeds = cloud.speeds(speed, doubt, config, count, rng)
-    centre = middle(way, state)
+    shape, state = shape_of(rig, way, left, float(place[2]), FACING if given else FACING_FOUND)
+    depth = cloud.depths(rig, float(place[2]), config.filter.particles, rng)
+    speeds = cloud.speeds(speed, doubt, config, config.filter.particles, rng)
+    pace, unbound = abs(speed or config.filter.start_speed), not config.filter.path_constraint
     if unbound:
-        axes = way.frame(state[0])[1]
-        shape = Shape(shape.corners @ axes.T)
-        aside = config.filter.free_share * abs(speed or config.filter.start_speed) * rng.normal(size=(count, 2))
-        states = free.started(centre, depth, speeds[:, None] * axes[:, 0] + aside @ axes[:, 1:].T * [1.0, 0.5, 1.0])
+        shape, states = _unbound(way, shape, state, depth, speeds, config.filter.free_share * pace, rng)
     else:
-        states = cloud.along_sight(way, state, centre, depth)
+        states = cloud.along_sight(way, state, middle(way, state), depth)
         states[:, 1] = speeds
     cells = patches.part_values(views["left"], left[None], config.observation.parts)[0]
     target = Target(
@@ -64,14 +70,14 @@ def start(
         config=config,
         rng=rng,
         states=states,
-        log_weights=np.full(count, -np.log(count)),
+        log_weights=np.full(len(states), -np.log(len(states))),
         sought=patches.template(views["left"], left),
         first=cells,
         reference=cells,
         t=at[1],
         given=given,
         on_path=on_path,
-        free_drift=config.filter.free_share * 0.2 * abs(speed or config.filter.start_speed),
+        free_drift=config.filter.free_share * 0.2 * pace,
         oriented=speed is not None and not given,
         free=unbound,
         last_seen=at[1],
@@ -82,6 +88,16 @@ def start(
         cloud.take_in(target)
     target.causal.append((*at, particles.moments(target.states, target.log_weights), bool(target.looks)))
     return target
+
+
+def _unbound(
+    way: Way, shape: Shape, state: Array, depth: Array, speeds: Array, drift: float, rng: np.random.Generator
+) -> tuple[Shape, Array]:
+    """The front's shape in space, and particles of six degrees of freedom that go along the way, more or less."""
+    axes = way.frame(state[0])[1]
+    aside = drift * rng.normal(size=(len(depth), 2))
+    velocity = speeds[:, None] * axes[:, 0] + aside @ axes[:, 1:].T * [1.0, 0.5, 1.0]
+    return Shape(shape.corners @ axes.T), free.started(middle(way, state), depth, velocity)
 
 
 def update(target: Target, views: dict[str, list[Grey]], at: tuple[int, float]) -> None:

@@ -9,15 +9,12 @@ from visfuse_cli.commands.fuse_cameras.follow import estimated_offsets, eyes_of,
 from visfuse_cli.commands.fuse_cameras.results import Results, settle, summary_of
 from visfuse_cli.commands.fuse_cameras.scene import given_offsets, interval, open_footage, read, shorter
 from visfuse_cli.commands.fuse_cameras.video import annotate, drawn_tracks, plan_of
-from visfuse_cli.files.folders import paths_of
 from visfuse_cli.files.images import write_image
-from visfuse_cli.files.runfolder import RunFolder
-from visfuse_cli.files.spool import TrackSpool
 from visfuse_cli.files.video import describe
 from visfuse_cli.fusing.audit import complaints
 from visfuse_cli.fusing.settings import FuseConfig
 from visfuse_cli.fusing.tracker import Tracker
-from visfuse_cli.pipeline import Run
+from visfuse_cli.pipeline import opened
 from visfuse_cli.records import RunRequest, RunResult
 
 __all__ = ["FuseConfig", "run", "text"]
@@ -30,11 +27,7 @@ def run(request: RunRequest) -> RunResult:
     inputs = [describe(path) for path in (*scene.files, *(path for each in scene.footage for path in each.files))]
     offsets = given_offsets(config, scene)
     results = Results()
-    with (
-        RunFolder(request.out, request.overwrite, inputs=[request.input, *paths_of(inputs)]) as folder,
-        Run(request.progress) as run_,
-        TrackSpool(folder, "fuse-cameras", request.seed, "world") as spool,
-    ):
+    with opened(request, inputs, "world") as (folder, run_, spool):
         sources = open_footage(scene, request)
         with run_.stage("warm up"):
             eyes = eyes_of(scene, sources, config)

@@ -17,16 +17,14 @@ from visfuse_cli.errors import InputError, UsageError
 from visfuse_cli.files import detections as detection_files
 from visfuse_cli.files import homography as homography_files
 from visfuse_cli.files.atomic import replacing
-from visfuse_cli.files.folders import paths_of
 from visfuse_cli.files.lanes_file import read_lanes, write_lanes
-from visfuse_cli.files.runfolder import RunFolder
 from visfuse_cli.files.spool import TrackSpool, write_table
 from visfuse_cli.files.video import VideoSource, describe, is_clip_folder, list_clips, open_source
 from visfuse_cli.files.video_writer import VideoWriter
 from visfuse_cli.files.wall_clock import began, check_pattern, known_zone
 from visfuse_cli.maths.cameras import ground_camera, raised
 from visfuse_cli.maths.polygons import Polygon
-from visfuse_cli.pipeline import Run
+from visfuse_cli.pipeline import Run, opened
 from visfuse_cli.records import Array, GroundCamera, GroundMap, RunRequest, RunResult
 from visfuse_cli.tracking.annotate import annotate
 from visfuse_cli.tracking.ledger import Ledger, utc
@@ -98,11 +96,7 @@ def run(request: RunRequest) -> RunResult:
     results = Findings(Ledger(job.config))
     for path in job.clips:
         _check(path, job, results)
-    with (
-        RunFolder(request.out, request.overwrite, inputs=[request.input, *paths_of(job.inputs)]) as folder,
-        Run(request.progress) as run_,
-        TrackSpool(folder, "speed", request.seed, "ground") as spool,
-    ):
+    with opened(request, job.inputs, "ground") as (folder, run_, spool):
         for doubt in results.doubts:
             run_.warn(doubt)
         next_id = 1

@@ -11,15 +11,12 @@ from visfuse_cli.commands.track_imm.pan_tilt import PanTiltRun
 from visfuse_cli.commands.track_imm.scene import open_views
 from visfuse_cli.commands.track_imm.stereo import StereoRun
 from visfuse_cli.errors import InputError
-from visfuse_cli.files.folders import paths_of
-from visfuse_cli.files.runfolder import RunFolder
 from visfuse_cli.files.scene import check_scene, file
 from visfuse_cli.files.sensors import read_sensors
-from visfuse_cli.files.spool import TrackSpool
 from visfuse_cli.files.video import VideoSource, describe
 from visfuse_cli.moving.annotate import UNITS
 from visfuse_cli.moving.settings import ImmConfig
-from visfuse_cli.pipeline import Run
+from visfuse_cli.pipeline import Run, opened
 from visfuse_cli.records import RunRequest, RunResult
 
 __all__ = ["ImmConfig", "run", "text"]
@@ -31,11 +28,7 @@ def run(request: RunRequest) -> RunResult:
     """Follow what moves in a scene; raises a VisfuseError before the first frame on bad input."""
     head = _head(request)
     inputs = [describe(path) for path in (*head.files, *head.views.values())]
-    with (
-        RunFolder(request.out, request.overwrite, inputs=[request.input, *paths_of(inputs)]) as folder,
-        Run(request.progress) as run_,
-        TrackSpool(folder, "track-imm", request.seed, head.frame_of_reference) as spool,
-    ):
+    with opened(request, inputs, head.frame_of_reference) as (folder, run_, spool):
         for warning in head.sensors.warnings:
             run_.warn(warning)
         sources = open_views(head.views, request)

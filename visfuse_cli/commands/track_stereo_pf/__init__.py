@@ -20,12 +20,10 @@ from visfuse_cli.facing.front import Target
 from visfuse_cli.facing.output import track_record
 from visfuse_cli.facing.rival import follow_triangulated
 from visfuse_cli.facing.settings import StereoConfig
-from visfuse_cli.files.folders import paths_of
-from visfuse_cli.files.runfolder import RunFolder
 from visfuse_cli.files.spool import TrackSpool
 from visfuse_cli.files.video import describe
 from visfuse_cli.files.video_writer import VideoWriter
-from visfuse_cli.pipeline import Run
+from visfuse_cli.pipeline import Run, opened
 from visfuse_cli.records import Array, RunRequest, RunResult
 
 WAY_POINTS = 40  # that a path is drawn with
@@ -48,11 +46,7 @@ def run(request: RunRequest) -> RunResult:
     scene = read(request)
     inputs = [describe(path) for path in (*scene.files, *scene.views.values())]
     results = _Results()
-    with (
-        RunFolder(request.out, request.overwrite, inputs=[request.input, *paths_of(inputs)]) as folder,
-        Run(request.progress) as run_,
-        TrackSpool(folder, "track-stereo-pf", request.seed, "left-camera") as spool,
-    ):
+    with opened(request, inputs, "left-camera") as (folder, run_, spool):
         sources = open_views(scene, request)
         for targets in follow(scene, sources, config, request, run_):
             with run_.stage("settle"):

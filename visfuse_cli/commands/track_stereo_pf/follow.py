@@ -16,7 +16,6 @@ from visfuse_cli.facing.look import settle_on
 from visfuse_cli.facing.settings import StereoConfig
 from visfuse_cli.files.video import VideoSource, open_source
 from visfuse_cli.maths.paths import Way
-from visfuse_cli.maths.planes import triangulated
 from visfuse_cli.pipeline import Run
 from visfuse_cli.records import Array, GivenTarget, Image, Lens, RunRequest
 from visfuse_cli.vision import patches
@@ -27,6 +26,8 @@ from visfuse_cli.vision.patches import Grey
 
 WARMUP_PICTURES = 41
 AHEAD_M, AHEAD_S = 50.0, 3.0  # of a provisional way, until the track tells its own
+Views = dict[str, list[Grey]]  # pyramids by view
+At = tuple[int, float]  # number and time (s) of a pair
 OFF_PX, NONSENSE_PX = 2.0, 25.0  # median distance from epipolar lines: warned of, refused
 
 
@@ -55,54 +56,114 @@ def follow(
     if not scene.given:
         with run_.stage("warm up"):
             finder = Finder(scene.rig, _empty(scene, request, straight["left"]), config)
-    waiting = sorted(enumerate(scene.given, start=1), key=lambda pair: pair[1].frame)
-    followed: list[Target] = []
-    next_id, first = 1, True
+    follower, first = Follower(scene, config, request.seed, finder, run_), True
     for pair in pairs(sources, run_):
         run_.count("pairs")
-        at = (pair.frames["left"].index, pair.t)
         with run_.stage("straighten"):
             pictures = {name: straight[name].picture(pair.frames[name].image) for name in VIEWS}
             views = {name: patches.pyramid(picture) for name, picture in pictures.items()}
         if first:
             _check_epipolar(scene, pictures, run_)
             first = False
-        with run_.stage("filter"):
-            for each in followed:
-                cloud.predict(each, pair.t)
+        yield follower.step(pictures["left"], views, (pair.frames["left"].index, pair.t))
+    yield follower.finish()
+
+
+class Follower:
+    """Follows the vehicles of a scene; `step` for every pair of straight pictures, `finish` after the last."""
+
+    def __init__(self, scene: Scene, config: StereoConfig, seed: int, finder: Finder | None, run_: Run) -> None:
+        self._scene, self._config, self._seed, self._finder, self._run = scene, config, seed, finder, run_
+        self._way = scene.way if config.filter.path_constraint else None
+        self._waiting = sorted(enumerate(scene.given, start=1), key=lambda pair: pair[1].frame)
+        self._followed: list[Target] = []
+        self._next_id = 1
+
+    def step(self, left: Image, views: Views, at: At) -> list[Target]:
+        """One pair further, the left picture and both pyramids; returns those that nobody follows any more."""
+        with self._run.stage("filter"):
+            for each in self._followed:
+                cloud.predict(each, at[1])
                 target.update(each, views, at)
-        ended = [each for each in followed if _over(each, scene, pair.t)]
-        followed = [each for each in followed if each not in ended]
-        with run_.stage("newcomers"):
-            while waiting and waiting[0][1].frame <= at[0]:
-                identity, given = waiting.pop(0)
-                begun = _begin_given(identity, given, scene, config, views, at, request.seed, run_)
-                followed += [begun] if begun is not None else []
-            if finder is not None:
-                known = [front.left_quad(each) for each in followed]
-                for found in finder.look(pictures["left"], pair.t, known):
-                    new = _begin_found(next_id, found, scene, config, views, at, request.seed)
-                    if new is not None:
-                        followed.append(new)
-                        next_id += 1
-                _settle_on_regions(followed, finder, views, at)
-        yield ended
-    for each in followed:
-        each.ended_by = "end of footage"
-    for identity, given in waiting:
-        run_.warn(f"target {identity} of init.yaml begins at frame {given.frame}, which the footage does not have")
-    yield followed
+        ended = [each for each in self._followed if _over(each, self._scene, at[1])]
+        self._followed = [each for each in self._followed if each not in ended]
+        with self._run.stage("newcomers"):
+            while self._waiting and self._waiting[0][1].frame <= at[0]:
+                identity, given = self._waiting.pop(0)
+                new = self._given(identity, given, views, at)
+                if new is None:
+                    self._run.warn(f"target {identity} of init.yaml was not found in the right view at frame {at[0]}")
+                self._followed += [new] if new is not None else []
+            if self._finder is not None:
+                known = [front.left_quad(each) for each in self._followed]
+                for found in self._finder.look(left, at[1], known):
+                    new = self._found(found, views, at)
+                    self._followed += [new] if new is not None else []
+                    self._next_id += new is not None
+                self._settle_on_regions(self._finder, views, at)
+        return ended
 
+    def finish(self) -> list[Target]:
+        """Those that were followed to the end."""
+        for each in self._followed:
+            each.ended_by = "end of footage"
+        for identity, given in self._waiting:
+            self._run.warn(
+                f"target {identity} of init.yaml begins at frame {given.frame}, which the footage does not have"
+            )
+        return self._followed
 
-def _settle_on_regions(
-    followed: list[Target], finder: Finder, views: dict[str, list[Grey]], at: tuple[int, float]
-) -> None:
-    """Let vehicles found unaided keep to the regions that move, where each has one of its own."""
-    for each in followed:
-        if len(each.looks) > 1 and each.looks[-1].t == at[1]:
-            region = finder.around(each.looks[-1].quads["left"])
-            if region is not None:
-                settle_on(each, views, region, at[1] - each.looks[-2].t)
+    def _given(self, identity: int, given: GivenTarget, views: Views, at: At) -> Target | None:
+        """A named target on the scene's path, or on one straight at the camera until its track tells better."""
+        quads = self._quads(given.left, given.right, views)
+        if quads is None:
+            return None
+        if self._way is not None:
+            return self._begin(identity, self._way, views, quads, given.speed, at)
+        place = front.place_of(self._scene.rig, *quads)
+        ahead = None if place is None else Way(np.stack([place, place - [0, 0, AHEAD_M]]))
+        return None if ahead is None else self._begin(identity, ahead, views, quads, given.speed, at)
+
+    def _found(self, found: Found, views: Views, at: At) -> Target | None:
+        """A target where something moves, along the scene's path, or along its own motion so far."""
+        rig, quads = self._scene.rig, self._quads(found.quad, None, views)
+        place = None if quads is None else front.place_of(rig, *quads)
+        if quads is None or place is None:
+            return None
+        velocity, doubt = found.velocity(rig, place), found.growth_sigma * float(place[2])
+        if self._way is not None:
+            along = float(self._way.frame(np.array(self._way.nearest(place)))[1][:, 0] @ velocity)
+            return self._begin(self._next_id, self._way, views, quads, along, at, doubt)
+        speed = max(float(np.linalg.norm(velocity)), 1e-3)
+        way = Way(np.stack([place, place + AHEAD_S * max(speed, 0.1) * velocity / speed]))
+        return self._begin(self._next_id, way, views, quads, speed, at, doubt)
+
+    def _quads(self, left: Array, right: Array | None, views: Views) -> tuple[Array, Array] | None:
+        """Left and right quads (4, 2) px, the right one looked for where it is not known."""
+        if right is None:
+            right = match(self._scene.rig, views, left, self._config.observation.good)
+        return None if right is None else (left, right)
+
+    def _begin(
+        self,
+        identity: int,
+        way: Way,
+        views: Views,
+        quads: tuple[Array, Array],
+        speed: float | None,
+        at: At,
+        doubt: float | None = None,
+    ) -> Target | None:
+        rig, on_path = self._scene.rig, self._way is not None
+        return target.start(identity, rig, way, self._config, views, quads, speed, at, self._seed, doubt, on_path)
+
+    def _settle_on_regions(self, finder: Finder, views: Views, at: At) -> None:
+        """Let vehicles found unaided keep to the regions that move, where each has one of its own."""
+        for each in self._followed:
+            if len(each.looks) > 1 and each.looks[-1].t == at[1]:
+                region = finder.around(each.looks[-1].quads["left"])
+                if region is not None:
+                    settle_on(each, views, region, at[1] - each.looks[-2].t)
 
 
 def _empty(scene: Scene, request: RunRequest, straight: Straight) -> Image:
@@ -134,76 +195,6 @@ def _check_epipolar(scene: Scene, pictures: dict[str, Image], run_: Run) -> None
     if found[0] > NONSENSE_PX:
         raise InputError(f"{said}; this is not the calibration of this footage, or left and right are exchanged")
     run_.warn(f"{said}; the pair has moved since it was calibrated, or the views are not of one instant")
-
-
-def _begin_given(
-    identity: int,
-    given: GivenTarget,
-    scene: Scene,
-    config: StereoConfig,
-    views: dict[str, list[Grey]],
-    at: tuple[int, float],
-    seed: int,
-    run_: Run,
-) -> Target | None:
-    right = given.right
-    if right is None:
-        right = match(scene.rig, views, given.left, config.observation.good)
-    begun = None
-    if right is not None:
-        begun = _begin(identity, given.left, right, given.speed, scene, config, views, at, seed)
-    if begun is None:
-        run_.warn(f"target {identity} of init.yaml was not found in the right view at frame {at[0]}")
-    return begun
-
-
-def _begin_found(
-    identity: int,
-    found: Found,
-    scene: Scene,
-    config: StereoConfig,
-    views: dict[str, list[Grey]],
-    at: tuple[int, float],
-    seed: int,
-) -> Target | None:
-    """A target where something moves, along the scene's path, or along its own motion so far."""
-    left = found.quad
-    right = match(scene.rig, views, left, config.observation.good)
-    if right is None:
-        return None
-    place = triangulated(scene.rig, left.mean(axis=0), right.mean(axis=0))
-    if not np.isfinite(place).all() or place[2] <= 0.1:
-        return None
-    velocity = found.velocity(scene.rig, place)
-    speed, doubt = max(float(np.linalg.norm(velocity)), 1e-3), found.growth_sigma * float(place[2])
-    way = scene.way if config.filter.path_constraint else None
-    if way is None:
-        way = Way(np.stack([place, place + AHEAD_S * max(speed, 0.1) * velocity / speed]))
-        return target.start(identity, scene.rig, way, config, views, (left, right), speed, at, seed, doubt, False)
-    along = float(way.frame(np.array(way.nearest(place)))[1][:, 0] @ velocity)
-    return target.start(identity, scene.rig, way, config, views, (left, right), along, at, seed, doubt, True)
-
-
-def _begin(
-    identity: int,
-    left: Array,
-    right: Array,
-    speed: float | None,
-    scene: Scene,
-    config: StereoConfig,
-    views: dict[str, list[Grey]],
-    at: tuple[int, float],
-    seed: int,
-) -> Target | None:
-    """A target on the scene's path, or on one straight at the camera until its track tells better."""
-    way = scene.way if config.filter.path_constraint else None
-    on_path = way is not None
-    if way is None:
-        place = triangulated(scene.rig, left.mean(axis=0), right.mean(axis=0))
-        if not np.isfinite(place).all() or place[2] <= 0.1:
-            return None
-        way = Way(np.stack([place, place - [0, 0, AHEAD_M]]))
-    return target.start(identity, scene.rig, way, config, views, (left, right), speed, at, seed, None, on_path)
 
 
 def _over(target: Target, scene: Scene, t: float) -> bool:
