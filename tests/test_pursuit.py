@@ -136,10 +136,10 @@ def test_two_targets_in_one_place_that_go_alike_are_one_and_the_older_stays():
 
 def test_what_was_first_seen_in_part_gives_way_to_the_whole():
     held = np.array([10.0, 30, 30, 50])
-    assert find._outgrows(np.array([9.0, 10, 31, 52]), held)
-    assert not find._outgrows(np.array([9.0, 29, 31, 52]), held)  # as large as it
-    assert not find._outgrows(np.array([9.0, 10, 61, 52]), held)  # two side by side
-    assert not find._outgrows(np.array([22.0, 10, 42, 52]), held)  # somebody else
+    assert find._outgrows(np.array([9.0, 10, 31, 52]), held, find.WIDER)
+    assert not find._outgrows(np.array([9.0, 29, 31, 52]), held, find.WIDER)  # as large as it
+    assert not find._outgrows(np.array([9.0, 10, 61, 52]), held, find.WIDER)  # two side by side
+    assert not find._outgrows(np.array([22.0, 10, 42, 52]), held, find.WIDER)  # somebody else
 
 
 def test_a_gaze_that_passes_the_half_turn_is_predicted_as_any_other():

@@ -11,26 +11,30 @@ import numpy as np
 from visfuse_cli.gazing.head import Head
 from visfuse_cli.moving.settings import ImmConfig
 from visfuse_cli.records import Array, Image
-from visfuse_cli.vision import normal_flow
+from visfuse_cli.vision import normal_flow, patches
 from visfuse_cli.vision.patches import Grey
 
 GAP_S = 0.1  # between the pictures that are compared: what is slow has then moved, too
 ALIKE = 0.4  # overlap with the region of the frame before
 JOINED = 0.5  # of the narrower one's width: what lies in line, and no further than the higher one is high, is one thing
 KNOWN = 0.2  # overlap with what is followed already
-LARGER, WIDER, HELD = 1.4, 1.6, 0.8  # times the area and, at most, the width of what is followed, and its share inside
+LARGER, HELD = 1.4, 0.8  # times the area of what is followed, and its share inside: the whole of a part
+WIDER, UNCUT = 1.6, 3.0  # times its width, at most: two side by side are wider; and of what the picture's side cut off
 
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """One frame: its number, time, gaze, picture and grey pyramid, and what was followed in it, boxes [x, y, w, h]."""
+    """One frame: its number, time, gaze, picture, grey pyramid, and what was followed in it.
+
+    That is boxes [x, y, w, h], each with how many times wider the whole of it may be.
+    """
 
     frame: int
     t: float
     gaze: Array
     picture: Image
     levels: list[Grey]
-    known: list[Array]
+    known: list[tuple[Array, float]]
 
     @property
     def grey(self) -> Image:
@@ -81,13 +85,13 @@ class Finder:
             least, gradient = np.minimum(least, np.linalg.norm(rest, axis=-1)), np.maximum(gradient, slope)
         return _whole(normal_flow.grown(least, gradient, known, settings.residual_px))
 
-    def _confirmed(self, regions: Sequence[tuple[Array, int]], known: Sequence[Array]) -> list[Array]:
+    def _confirmed(self, regions: Sequence[tuple[Array, int]], known: Sequence[tuple[Array, float]]) -> list[Array]:
         least = self._config.segmentation.smallest * self._views[0].grey.size
-        held = [np.append(box[:2], box[:2] + box[2:]) for box in known]
+        held = [(np.append(box[:2], box[:2] + box[2:]), wider) for box, wider in known]
         kept, ready = [], []
         for box, area in regions:
-            over = [other for other in held if _shared(box, other) > KNOWN]
-            if area < least or len(over) > 1 or any(not _outgrows(box, other) for other in over):
+            over = [each for each in held if _shared(box, each[0]) > KNOWN]
+            if area < least or len(over) > 1 or any(not _outgrows(box, *each) for each in over):
                 continue
             boxes = [*next((each for each in self._candidates if _shared(each[-1], box) > ALIKE), []), box]
             if len(boxes) < self._config.life.confirm_frames:
@@ -124,11 +128,17 @@ def _above(box: Array, other: Array) -> bool:
     return bool(across > JOINED * min(box[2] - box[0], other[2] - other[0]) and gap < high)
 
 
-def _outgrows(box: Array, held: Array) -> bool:
-    """Whether a box [u0, v0, u1, v1] is the whole of what was followed in part."""
+def _outgrows(box: Array, held: Array, wider: float) -> bool:
+    """Whether a box [u0, v0, u1, v1] is the whole, at most so many times wider, of what was followed in part."""
     (wide, high), (w, h) = box[2:] - box[:2], held[2:] - held[:2]
     inner = np.clip(np.minimum(box[2:], held[2:]) - np.maximum(box[:2], held[:2]), 0, None)
-    return bool(wide * high > LARGER * w * h and wide < WIDER * w and np.prod(inner) > HELD * w * h)
+    return bool(wide * high > LARGER * w * h and wide < wider * w and np.prod(inner) > HELD * w * h)
+
+
+def may_be_wider(quad: Array, wide: int) -> float:
+    """How many times wider what was first seen in a quad (4, 2) px may turn out to be, in a picture so wide."""
+    side = patches.side(quad)[0]
+    return UNCUT if min(quad[:, 0].min(), wide - quad[:, 0].max()) < side else WIDER
 
 
 def shared(box: Array, other: Array) -> float:

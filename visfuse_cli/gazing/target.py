@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from visfuse_cli.gazing.find import View
+from visfuse_cli.gazing.find import View, may_be_wider
 from visfuse_cli.gazing.head import Head
 from visfuse_cli.gazing.models import Courses, combined
 from visfuse_cli.maths import course, imm
@@ -64,6 +64,7 @@ class Target:
     colours: Array  # (bands, 3): what it looks like
     given: bool
     last_seen: float
+    wider: float  # times its width, at most, that it may be where it was begun in part
     seen_since: float = -np.inf  # s: since when it is seen without a break
     seen: Rows = field(default_factory=lambda: Rows(SEEN))
     noises: list[Array] = field(default_factory=list)  # R (4, 4) of what was measured before there was a bank
@@ -112,7 +113,8 @@ def start(
 ) -> Target | None:
     """Begin with a target in a quad (4, 2) px of a view; None where it is not on the ground."""
     sought, colours = patches.holding(view.levels, quad), looks(view.picture, quad)
-    target = Target(identity, head, config, models, np.ones(2), np.zeros(2), sought, colours, given, view.t)
+    wider = may_be_wider(quad, view.grey.shape[1])
+    target = Target(identity, head, config, models, np.ones(2), np.zeros(2), sought, colours, given, view.t, wider)
     at = target.anchor(quad)
     place = head.ground(at, view.gaze, target.height)
     if not np.isfinite(place).all():

@@ -37,7 +37,7 @@ class Tracker(Pursuit[Target, View, Expected, Array]):
         with self._stage("filter"):
             self._follow(view)
         self._part(t)
-        view.known.extend(each.seen[-1]["box"] for each in self._followed)
+        view.known.extend((each.seen[-1]["box"], each.wider) for each in self._followed)
         self._begin_given(view)
         if self._wanted(t):
             with self._stage("newcomers"):
@@ -83,7 +83,7 @@ class Tracker(Pursuit[Target, View, Expected, Array]):
             for view in since[1:]:
                 one.follow(new, view, one.expect(new, view), 0.0)
             for view in since:
-                view.known.append(new.seen[-1]["box"])
+                view.known.append((new.seen[-1]["box"], new.wider))
 
     def _part_of(self, quad: Array, view: View) -> tuple[Target | None, bool]:
         """Who is followed in a part of a quad (4, 2) of a view, if anybody, and whether the quad is to be begun."""
