@@ -66,6 +66,9 @@ def test_the_ground_track_is_within_two_per_cent_of_the_range(scene, result):
     assert len(off) > 85
     assert np.sqrt(np.mean(np.sum(off[:, :2] ** 2, axis=1) / far**2)) < 0.02
     assert np.sqrt(np.mean(np.sum(off[:, 2:] ** 2, axis=1))) < 0.1
+    cov = np.array([state["covariance"] for state in document(result)["tracks"][0]["states"]])[: len(off), :2, :2]
+    normalised = np.einsum("ti,ti->t", off[:, :2], np.linalg.solve(cov, off[:, :2, None])[..., 0])
+    assert np.median(normalised) < 10  # the box lies off its target for good, and the covariance says so
 
 
 def test_what_the_contract_promises_is_there(result):

@@ -78,8 +78,12 @@ def test_nobody_needs_to_name_the_person(scene, tmp_path):
     (bare / "init.yaml").unlink()
     done = run(bare, *WHEELS, "--out", tmp_path / "run", "--no-video", "--no-report")
     assert done.returncode == 0, done.stderr
-    off = errors(scene, tracks(tmp_path / "run")[0])
+    track = tracks(tmp_path / "run")[0]
+    off = errors(scene, track)
     assert np.sqrt(np.mean(np.sum(off[:, :3] ** 2, axis=1))) < 0.2
+    cov = np.array([state["covariance"] for state in track["states"]])[:, :3, :3]
+    normalised = np.einsum("ti,ti->t", off[:, :3], np.linalg.solve(cov, off[:, :3, None])[..., 0])
+    assert np.median(normalised) < 12  # a box that was found lies off its target, and the covariance says so
 
 
 def test_the_same_input_gives_the_same_bytes(scene, tmp_path):

@@ -142,6 +142,15 @@ def test_what_was_first_seen_in_part_gives_way_to_the_whole():
     assert not find._outgrows(np.array([22.0, 10, 42, 52]), held, find.WIDER)  # somebody else
 
 
+def test_what_the_side_of_the_picture_cut_off_may_turn_out_far_wider():
+    cut, free = (np.array([[x, 30.0], [x + 16, 30], [x + 16, 90], [x, 90]]) for x in (10, 40))
+    assert find.may_be_wider(cut, 100) == find.may_be_wider(100 - cut, 100) == find.UNCUT
+    assert find.may_be_wider(free, 100) == find.WIDER
+    part, whole = np.array([10.0, 30, 26, 90]), np.array([2.0, 30, 30, 92])
+    assert find._outgrows(whole, part, find.UNCUT)
+    assert not find._outgrows(whole, part, find.WIDER)
+
+
 def test_a_gaze_that_passes_the_half_turn_is_predicted_as_any_other():
     t = np.arange(0, 4, 0.04)
     places = np.column_stack([1.5 * (t - 2), np.full_like(t, -10.0)])  # behind, from one side to the other

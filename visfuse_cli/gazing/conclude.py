@@ -20,6 +20,7 @@ Z95 = 1.959963984540054
 ANGLE_Q = (0.01, 0.1, 1.0)  # rad^2 s^-3 of a constant velocity of angles: the best of them is the rival
 SETTLED_S = 1.0
 SLOWEST = 0.12  # m/s
+GIVEN_PX, FOUND_PX = 0.5, 1.5  # that the box of a target lies off it, each way
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,8 +70,21 @@ def _part(target: Target, ground: GroundMap) -> _Part | None:
         one = belief(bank)
         mean[k], cov[k], log_mu[k] = one.mean, one.cov, bank.log_mu
     J = ground_shift(ground, mean[:, :2])
-    cov[:, :2, :2] += J @ ground.cov @ transpose(J)
+    cov[:, :2, :2] += J @ ground.cov @ transpose(J) + _of_template(target, mean[:, :2])
     return _Part(seen, target.believed[:count], mean, cov, log_mu)
+
+
+def _of_template(target: Target, places: Array) -> Array:
+    """What the box's own place on the target adds (T, 2, 2): it stays off as it is and does not average out."""
+    reach = np.column_stack([places, np.full(len(places), target.height)]) - target.head.centre
+    flat = np.hypot(reach[:, 0], reach[:, 1])
+    along = reach[:, :2] / flat[:, None]
+    across = along[:, ::-1] * [-1, 1]
+    far = np.linalg.norm(reach, axis=1)
+    off = (GIVEN_PX if target.given else FOUND_PX) / target.head.lens.K[0, 0] * far  # m, square to the line of sight
+    down = off * far / np.abs(reach[:, 2])  # where that meets the ground
+    parts = off[:, None] * across, down[:, None] * along
+    return np.asarray(sum(part[:, :, None] * part[:, None, :] for part in parts))
 
 
 def _summary(target: Target, whole: _Part) -> dict[str, Any]:

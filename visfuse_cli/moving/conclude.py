@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -20,6 +20,7 @@ FEWEST = 2  # measurements that make a part of a track
 Z95 = 1.959963984540054
 EGO_SHARE = 0.02  # of the camera's way: error of its pose that a static thing may seem to move by
 DRIFT_PX = np.array([0.1, 0.1, 0.02])  # of place and disparity: what the same template is off by in every frame
+FOUND_PX = np.array([1.5, 1.5, 0.0])  # more of it where the target's box was found, not given
 SLOWEST = 0.12  # m/s: what is slower on the whole is not said to move
 
 
@@ -53,7 +54,13 @@ def conclude(target: Target, ride: Ride) -> Settled | None:
     settled = _joined(parts)
     if np.count_nonzero(settled.measured) < target.config.life.min_frames:
         return None
-    return settled if target.given or _moved(settled) else None
+    if target.given:
+        return settled
+    if not _moved(settled):
+        return None
+    belief = settled.belief
+    off = _of_template(target.rig, belief.mean, ride.at(settled.seen["frame"]), FOUND_PX)
+    return replace(settled, belief=Gaussian(belief.mean, belief.cov + off))
 
 
 def _part(target: Target, ride: Ride) -> Settled | None:
@@ -70,7 +77,7 @@ def _part(target: Target, ride: Ride) -> Settled | None:
         belief = imm.combined(bank)
         mean[k], cov[k], log_mu[k] = belief.mean[:6], belief.cov[:6, :6], bank.log_mu
     poses = ride.at(seen["frame"])
-    cov += _of_pose(mean, poses) + _of_template(target.rig, mean, poses)
+    cov += _of_pose(mean, poses) + _of_template(target.rig, mean, poses, DRIFT_PX)
     return Settled(target, seen, Gaussian(mean, cov), log_mu, seen["nis"][measured[1:]])
 
 
@@ -91,15 +98,18 @@ def _of_pose(mean: Array, poses: NDArray[np.void]) -> Array:
     return added
 
 
-def _of_template(rig: StereoRig, mean: Array, poses: NDArray[np.void]) -> Array:
-    """What the template's own place in the target adds (T, 6, 6): it stays off as it is and does not average out."""
+def _of_template(rig: StereoRig, mean: Array, poses: NDArray[np.void], off: Array) -> Array:
+    """What the template's own place in the target adds (T, 6, 6), off by (3,) px of place and disparity.
+
+    It stays off as it is and does not average out.
+    """
     added = np.zeros((len(mean), 6, 6))
     fx, fy = np.diag(rig.left.K)[:2]
     x, y, z = np.moveaxis((mean[:, None, :3] - poses["T"][:, None]) @ poses["R"], -1, 0)[..., 0]
     J = np.zeros((len(mean), 3, 3))  # of the place in the camera's frame by u, v and disparity
     J[:, 0, 0], J[:, 1, 1] = z / fx, z / fy
     J[:, :, 2] = -np.stack([x, y, z], axis=1) * (z / (fx * rig.baseline))[:, None]
-    J = poses["R"] @ J * DRIFT_PX
+    J = poses["R"] @ J * off
     added[:, :3, :3] = J @ transpose(J)
     return added
 
