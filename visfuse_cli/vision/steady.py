@@ -124,16 +124,23 @@ def at_rest(pictures: Iterable[Image]) -> tuple[list[Image], float]:
     What follows a knock does not count. All are as bright as the first; one in which the scene cannot be found again is
     left out.
     """
-    waiting = list(pictures)
-    steady, exposure = Steady(waiting[0]), Exposure(waiting[0])
-    waiting = [levelled(picture, exposure.gain(picture)) for picture in waiting]
-    motions = [steady.register(picture) for picture in waiting]
-    found = [(picture, motion) for picture, motion in zip(waiting, motions, strict=True) if motion is not None]
-    places = np.array([moved(motion, steady.middle) for _, motion in found])
-    rest = np.median([motion for _, motion in found[: _before_knocks(places)]], axis=0)
-    ways = [motion @ np.linalg.inv(rest) for _, motion in found]
+    waiting = iter(pictures)
+    first = next(waiting)
+    steady, exposure = Steady(first), Exposure(first)
+    found, motions = [], []
+    for picture in itertools.chain([first], waiting):
+        even = levelled(picture, exposure.gain(picture))
+        motion = steady.register(even)
+        if motion is not None:
+            found.append(even)
+            motions.append(motion)
+    places = np.array([moved(motion, steady.middle) for motion in motions])
+    rest = np.median(motions[: _before_knocks(places)], axis=0)
+    ways = [motion @ np.linalg.inv(rest) for motion in motions]
     shake = float(np.median([steady.shift(way) for way in ways]))
-    return [steady.laid_back(picture, way) for (picture, _), way in zip(found, ways, strict=True)], shake
+    for k, way in enumerate(ways):
+        found[k] = steady.laid_back(found[k], way)  # one by one: they fill memory
+    return found, shake
 
 
 def _before_knocks(places: Array) -> int:

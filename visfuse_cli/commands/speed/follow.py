@@ -11,7 +11,7 @@ import numpy as np
 
 from visfuse_cli.files.spool import TrackSpool
 from visfuse_cli.files.video import VideoSource
-from visfuse_cli.pipeline import Run, helper, with_next
+from visfuse_cli.pipeline import Run, ahead, helper, with_next
 from visfuse_cli.records import Array, Frame, GroundCamera, Image, TimeAudit
 from visfuse_cli.tracking.camera_watch import CameraWatch
 from visfuse_cli.tracking.elsewhere import HandOver
@@ -60,8 +60,7 @@ def follow(clip: Clip, run_: Run, spool: TrackSpool, findings: Findings, first_i
     strangers = findings.strangers[clip.name] = Strangers(clip.camera)
     with helper() as hand_over:
         with run_.stage("warm up"):
-            pictures, shake = at_rest(sampled(clip.source, clip.config.background.warmup_s))
-            empty = empty_picture(pictures, min(STEADIED_PX, shake))
+            empty = _empty_scene(clip.source, clip.config.background.warmup_s)
             watch = findings.watches[clip.name] = CameraWatch(empty)
             look, lamps = _detector(clip, empty, hand_over), Headlights(empty, clip.camera)
         tracker = GroundTracker(clip.camera, clip.config, first_id, hand_over)
@@ -87,6 +86,13 @@ def follow(clip: Clip, run_: Run, spool: TrackSpool, findings: Findings, first_i
     for warning in (*audit.warnings, *watch.warnings(clip.name)):
         run_.warn(warning)
     return tracker.next_id
+
+
+def _empty_scene(source: VideoSource, warmup_s: float) -> Image:
+    """The scene without its traffic, from the first `warmup_s` seconds; the pictures it comes from are not kept."""
+    with ahead(lambda: sampled(source, warmup_s)) as waiting:
+        pictures, shake = at_rest(waiting)
+    return empty_picture(pictures, min(STEADIED_PX, shake))
 
 
 def _steadied(source: VideoSource, watch: CameraWatch, run_: Run) -> Iterator[Frame]:
