@@ -37,6 +37,7 @@ MAY_IMPORT = {
         "report",
         "config",
         "records",
+        "threads",
         "errors",
     },
     "evaluate": {"maths", "files", "records", "errors"},

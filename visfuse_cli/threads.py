@@ -1,7 +1,8 @@
-"""How many threads a run's libraries may use: the variable VISFUSE_THREADS, where several runs share a machine."""
+"""What a run may take of a machine that it shares: threads (the variable VISFUSE_THREADS) and memory."""
 
 from __future__ import annotations
 
+import ctypes
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -22,6 +23,13 @@ def thread_cap() -> int | None:
     if not (text.isdecimal() and 0 < int(text) <= 1024):
         raise UsageError(f"{VARIABLE}={text}: a number of threads, 1 to 1024")
     return int(text)
+
+
+def give_back() -> None:
+    """Hand freed memory back to the system: glibc keeps what pictures took, for each thread that ever held some."""
+    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
+    if trim is not None:
+        trim(0)
 
 
 @contextmanager

@@ -13,6 +13,7 @@ from visfuse_cli.files.spool import TrackSpool
 from visfuse_cli.files.video import VideoSource
 from visfuse_cli.pipeline import Run, ahead, helper, with_next
 from visfuse_cli.records import Array, Frame, GroundCamera, Image, TimeAudit
+from visfuse_cli.threads import give_back
 from visfuse_cli.tracking.camera_watch import CameraWatch
 from visfuse_cli.tracking.elsewhere import HandOver
 from visfuse_cli.tracking.foreground import Detections, Detector, MovingRegions
@@ -61,6 +62,7 @@ def follow(clip: Clip, run_: Run, spool: TrackSpool, findings: Findings, first_i
     with helper() as hand_over:
         with run_.stage("warm up"):
             empty = _empty_scene(clip.source, clip.config.background.warmup_s)
+            give_back()
             watch = findings.watches[clip.name] = CameraWatch(empty)
             look, lamps = _detector(clip, empty, hand_over), Headlights(empty, clip.camera)
         tracker = GroundTracker(clip.camera, clip.config, first_id, hand_over)
@@ -81,6 +83,7 @@ def follow(clip: Clip, run_: Run, spool: TrackSpool, findings: Findings, first_i
             with run_.stage("learn"):
                 look.learn(frame, tracker)
         _settle(*tracker.finish(), of, tracker, lamps, run_, spool, findings.ledger)
+    give_back()
     findings.suns[clip.name] = look.report()
     audit = findings.audits[clip.name] = clip.source.audit()
     for warning in (*audit.warnings, *watch.warnings(clip.name)):
