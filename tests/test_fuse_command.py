@@ -328,6 +328,10 @@ def test_a_bad_option_is_refused_in_one_line(args, code, fragment, tmp_path):
     refused(run(folder, *args, "--out", tmp_path / "run"), code, fragment)
 
 
+def test_shares_are_for_boxes_only(scene, tmp_path):
+    refused(run(scene, "--out", tmp_path / "run", "--set", "sight.association=jpda"), 2, "sight.association")
+
+
 def test_footage_of_another_size_is_refused(scene, tmp_path):
     folder = tmp_path / "scene"
     shutil.copytree(scene, folder)

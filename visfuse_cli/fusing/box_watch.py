@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from visfuse_cli.fusing.clocks import places_alone
 from visfuse_cli.fusing.settings import FuseConfig
+from visfuse_cli.fusing.shares import shared
 from visfuse_cli.fusing.tracker import Newcomer, Tracker
 from visfuse_cli.fusing.visibility import visibility
 from visfuse_cli.maths import multiview, people
@@ -37,11 +38,28 @@ class BoxWatch:
         if gathered is None:
             self._left = []
             return [{} for _ in tracker.people]
-        grouped = groups(gathered, self._P)
-        places = [self._place(group) for group in grouped]
-        given = self._given(tracker, grouped, places)
+        known = np.array([person.confirmed for person in tracker.people], dtype=bool)
+        sightings: list[dict[int, Sighting]] = [{} for _ in known]
+        turns, free = [known, ~known], np.ones(len(gathered), dtype=bool)
+        if self._config.sight.association == "jpda":
+            free = self._share(gathered, tracker, known, sightings)
+            turns = [~known]
+        grouped = [np.flatnonzero(free)[group] for group in groups(gathered.of(free), self._P)]
+        given = self._given(tracker, grouped, [self._place(group) for group in grouped], turns)
         self._left = [group for k, group in enumerate(grouped) if k not in set(given.values())]
-        return [self._sightings(grouped[given[k]]) if k in given else {} for k in range(len(tracker.people))]
+        for who, which in given.items():
+            sightings[who] = self._sightings(grouped[which])
+        return sightings
+
+    def _share(
+        self, boxes: Boxes, tracker: Tracker, known: NDArray[np.bool_], sightings: list[dict[int, Sighting]]
+    ) -> NDArray[np.bool_]:
+        """Tell whoever is known (T,) of the boxes by how likely they are theirs; returns which are nobody's yet."""
+        beliefs = Gaussian(tracker.beliefs.mean[known], tracker.beliefs.cov[known])
+        told, claimed = shared(boxes, self._shown, self._dt, self._sizes, self._P, beliefs, self._config)
+        for who, seen in zip(np.flatnonzero(known), told, strict=True):
+            sightings[who] = seen
+        return ~claimed
 
     def newcomers(self, tracker: Tracker) -> list[Newcomer]:
         """People in what is left of the last instant, seen by two cameras or more."""
@@ -157,8 +175,17 @@ class BoxWatch:
         cov = np.linalg.inv(weight.sum(axis=0))
         return Gaussian(cov @ np.einsum("iab,ib->a", weight, ground.mean[group]), cov)
 
-    def _given(self, tracker: Tracker, grouped: list[NDArray[np.intp]], places: list[Gaussian]) -> dict[int, int]:
-        """Which group belongs to whom: one to one, by one-step conditional maximum likelihood. Wu 2010, eq. 7."""
+    def _given(
+        self,
+        tracker: Tracker,
+        grouped: list[NDArray[np.intp]],
+        places: list[Gaussian],
+        turns: list[NDArray[np.bool_]],
+    ) -> dict[int, int]:
+        """Which group belongs to whom: one to one, by one-step conditional maximum likelihood. Wu 2010, eq. 7.
+
+        `turns` says who (T,) may choose, one turn after the other.
+        """
         beliefs = tracker.beliefs
         usable = [k for k, place in enumerate(places) if np.isfinite(place.mean).all()]
         if not len(beliefs.mean) or not usable:
@@ -173,7 +200,7 @@ class BoxWatch:
         new = np.array([not person.confirmed for person in tracker.people])
         cost[np.ix_(new, alone)] = np.inf  # one camera alone begins nobody
         given: dict[int, int] = {}
-        for turn in (~new, new):  # who is known for longer has the first claim
+        for turn in turns:  # who is known for longer has the first claim
             taken = np.isin(usable, list(given.values()))
             pairs, _, _ = assign(np.where(turn[:, None] & ~taken, cost + 2.0 * alone, np.inf))
             given |= {int(who): usable[int(which)] for who, which in pairs}

@@ -55,6 +55,13 @@ class SightSettings(Section):
         0.03, gt=0, le=1, description="noise of a side of an external box, as a share of the box's height"
     )
     gate: float = Field(0.999, gt=0.5, lt=1, description="probability inside the association gates")
+    association: Literal["one-to-one", "jpda"] = Field(
+        "one-to-one",
+        description="of external boxes: one-to-one: each is of one person or nobody; jpda: each counts by how likely "
+        "it is whose, for detectors that miss and invent many",
+    )
+    detected: float = Field(0.9, gt=0, lt=1, description="share of its people that a detector boxes (jpda)")
+    false_boxes: float = Field(0.5, gt=0, le=1000, description="boxes of nobody in a picture, on the average (jpda)")
 
 
 class FusionSettings(Section):

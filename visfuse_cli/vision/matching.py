@@ -33,6 +33,11 @@ class Boxes:
     def __len__(self) -> int:
         return len(self.camera)
 
+    def of(self, rows: NDArray[np.bool_]) -> Boxes:
+        """Some of the boxes."""
+        ground = Gaussian(self.ground.mean[rows], self.ground.cov[rows])
+        return Boxes(self.camera[rows], self.z[rows], self.R[rows], ground, self.height[rows], self.height_sigma[rows])
+
 
 def disagreement(boxes: Boxes, P: Array) -> Array:
     """How badly each two boxes go together (n, n), chi-square; infinite within a camera and outside the gates.

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from visfuse_cli.commands.fuse_cameras.scene import Scene, open_footage, spacing, tolerance
+from visfuse_cli.errors import UsageError
 from visfuse_cli.files.video import VideoSource
 from visfuse_cli.fusing import clocks
 from visfuse_cli.fusing.eyes import BoxEyes, Eyes, PictureEyes
@@ -24,9 +25,17 @@ CLOCK_DONE_S = 0.02
 
 
 def eyes_of(scene: Scene, sources: dict[str, VideoSource], config: FuseConfig) -> Eyes:
-    """What looks at each set of frames: boxes from outside where there are any, else the pictures."""
+    """What looks at each set of frames: boxes from outside where there are any, else the pictures.
+
+    Raises UsageError where pictures are to be associated as boxes are.
+    """
     if scene.footage[0].boxes is not None:
         return BoxEyes(scene.views, [each.boxes or {} for each in scene.footage], config)
+    if config.sight.association != "one-to-one":
+        raise UsageError(
+            f"sight.association: {config.sight.association} is for boxes of a detector, <camera>.txt in the scene; "
+            "in pictures everybody is looked for where they are expected: leave it at one-to-one"
+        )
     return PictureEyes(scene.views, list(sources.values()), config)
 
 
