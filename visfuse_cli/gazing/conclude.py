@@ -49,7 +49,11 @@ def conclude(target: Target, ground: GroundMap) -> dict[str, Any] | None:
     t = whole.seen["t"]
     if not target.given and (off[far] < life.min_moved or off[far] < SLOWEST * (t[far] - t[0])):
         return None
-    return {"id": target.id, "summary": _summary(target, whole), "states": _states(target, whole)}
+    summary = _summary(target, whole)
+    whole.cov[:, :2, :2] += _of_template(
+        target, whole.mean[:, :2]
+    )  # not in the speed's doubt: off by the same everywhere
+    return {"id": target.id, "summary": summary, "states": _states(target, whole)}
 
 
 def _measured(seen: NDArray[np.void]) -> NDArray[np.bool_]:
@@ -70,7 +74,7 @@ def _part(target: Target, ground: GroundMap) -> _Part | None:
         one = belief(bank)
         mean[k], cov[k], log_mu[k] = one.mean, one.cov, bank.log_mu
     J = ground_shift(ground, mean[:, :2])
-    cov[:, :2, :2] += J @ ground.cov @ transpose(J) + _of_template(target, mean[:, :2])
+    cov[:, :2, :2] += J @ ground.cov @ transpose(J)
     return _Part(seen, target.believed[:count], mean, cov, log_mu)
 
 

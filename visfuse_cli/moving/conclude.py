@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -30,6 +30,7 @@ class Settled:
 
     target: Target
     seen: NDArray[np.void]  # rows of `target.SEEN`
+    poses: NDArray[np.void]  # rows of `journey.POSE`
     belief: Gaussian
     log_mu: Array  # (T, r)
     nis: Array  # of each measurement but the first
@@ -54,13 +55,7 @@ def conclude(target: Target, ride: Ride) -> Settled | None:
     settled = _joined(parts)
     if np.count_nonzero(settled.measured) < target.config.life.min_frames:
         return None
-    if target.given:
-        return settled
-    if not _moved(settled):
-        return None
-    belief = settled.belief
-    off = _of_template(target.rig, belief.mean, ride.at(settled.seen["frame"]), FOUND_PX)
-    return replace(settled, belief=Gaussian(belief.mean, belief.cov + off))
+    return settled if target.given or _moved(settled) else None
 
 
 def _part(target: Target, ride: Ride) -> Settled | None:
@@ -78,14 +73,16 @@ def _part(target: Target, ride: Ride) -> Settled | None:
         mean[k], cov[k], log_mu[k] = belief.mean[:6], belief.cov[:6, :6], bank.log_mu
     poses = ride.at(seen["frame"])
     cov += _of_pose(mean, poses) + _of_template(target.rig, mean, poses, DRIFT_PX)
-    return Settled(target, seen, Gaussian(mean, cov), log_mu, seen["nis"][measured[1:]])
+    return Settled(target, seen, poses, Gaussian(mean, cov), log_mu, seen["nis"][measured[1:]])
 
 
 def _joined(parts: Sequence[Settled]) -> Settled:
     """The parts of one track, one after another."""
     belief = Gaussian(*(np.concatenate([getattr(part.belief, name) for part in parts]) for name in ("mean", "cov")))
-    seen, log_mu, nis = (np.concatenate([getattr(part, name) for part in parts]) for name in ("seen", "log_mu", "nis"))
-    return Settled(parts[-1].target, seen, belief, log_mu, nis)
+    seen, poses, log_mu, nis = (
+        np.concatenate([getattr(part, name) for part in parts]) for name in ("seen", "poses", "log_mu", "nis")
+    )
+    return Settled(parts[-1].target, seen, poses, belief, log_mu, nis)
 
 
 def _of_pose(mean: Array, poses: NDArray[np.void]) -> Array:
@@ -150,23 +147,30 @@ def track_record(path: Settled) -> dict[str, Any]:
 
 
 def _states(path: Settled) -> Iterator[dict[str, Any]]:
-    names, latency = path.target.models.names, path.target.config.latency
-    for seen, mean, cov, log_mu in zip(path.seen, path.belief.mean, path.belief.cov, path.log_mu, strict=True):
-        speed = float(np.linalg.norm(mean[V]))
-        unit = mean[V] / max(speed, 1e-6)
-        state: dict[str, Any] = {
-            "frame": int(seen["frame"]),
-            "t": float(seen["t"]),
-            "position": mean[P].tolist(),
-            "velocity": mean[V].tolist(),
-            "covariance": symmetrise(cov).tolist(),
-            "speed": speed,
-            "speed_sigma": float(np.sqrt(max(float(unit @ cov[V, V] @ unit), 0.0))),
-            "box": {view: seen[view].tolist() for view in VIEWS if np.isfinite(seen[view]).all()},
-            "measured": bool(np.isfinite(seen["nis"])),
-        }
-        if len(names) > 1:
-            state["models"] = dict(zip(names, np.exp(log_mu).tolist(), strict=True))
-        if np.isfinite(seen["ahead"]).all():
-            state["ahead"] = {"t": float(seen["t"] + latency), "position": seen["ahead"].tolist()}
-        yield state
+    target, mean, cov = path.target, path.belief.mean, path.belief.cov
+    if not target.given:  # no part of the speed's doubt: the box is off by the same everywhere
+        cov = cov + _of_template(target.rig, mean, path.poses, FOUND_PX)
+    rows = zip(path.seen, mean, cov, path.log_mu, strict=True)
+    return (_state(target, *row) for row in rows)
+
+
+def _state(target: Target, seen: np.void, mean: Array, cov: Array, log_mu: Array) -> dict[str, Any]:
+    names, latency = target.models.names, target.config.latency
+    speed = float(np.linalg.norm(mean[V]))
+    unit = mean[V] / max(speed, 1e-6)
+    state: dict[str, Any] = {
+        "frame": int(seen["frame"]),
+        "t": float(seen["t"]),
+        "position": mean[P].tolist(),
+        "velocity": mean[V].tolist(),
+        "covariance": symmetrise(cov).tolist(),
+        "speed": speed,
+        "speed_sigma": float(np.sqrt(max(float(unit @ cov[V, V] @ unit), 0.0))),
+        "box": {view: seen[view].tolist() for view in VIEWS if np.isfinite(seen[view]).all()},
+        "measured": bool(np.isfinite(seen["nis"])),
+    }
+    if len(names) > 1:
+        state["models"] = dict(zip(names, np.exp(log_mu).tolist(), strict=True))
+    if np.isfinite(seen["ahead"]).all():
+        state["ahead"] = {"t": float(seen["t"] + latency), "position": seen["ahead"].tolist()}
+    return state
