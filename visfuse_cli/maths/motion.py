@@ -206,7 +206,8 @@ def bicycle_step(
     to_end[..., 0, :], to_end[..., 1, :] = c * along - s * across, s * along + c * across
     rates = (to_end * density[..., None, :]) @ transpose(to_end)
     mean_rate = (WEIGHTS / 2 @ rates.reshape(3, -1)).reshape(F.shape[1:])
-    return moved[-1], F[-1], symmetrise(mean_rate * dt[..., None, None])
+    # copies: tracks keep these, and a view would keep the other points as well
+    return moved[-1].copy(), F[-1].copy(), symmetrise(mean_rate * dt[..., None, None])
 
 
 def bicycle_velocity(x: Array) -> tuple[Array, Array]:
