@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from samples.people import Yard
+from samples.people import Yard, crossing
 from samples.scene import Array, Camera
 from samples.yard import write_calibration
 from visfuse_cli.maths import multiview, people
@@ -16,6 +17,18 @@ HIDDEN = 0.6
 WIDTH_M = 0.55
 REACH_M = 4.0
 """Metres from the yard's middle up to which somebody is invented."""
+
+
+def passing(seed: int) -> Yard:
+    """Two people who go the same way for eight seconds and change sides again and again."""
+    yard = crossing(seed, seconds=8.0, people=2, cameras=3)
+    times, along = np.linspace(0, 8, 6), np.linspace(-2, 2, 6)
+    sides = [np.array([(-1) ** (k + j // 2) for j in range(6)]) for k in range(2)]
+    walkers = [
+        replace(walker, times=times, knots=np.column_stack([along, 0.35 * side]))
+        for walker, side in zip(yard.walkers, sides, strict=True)
+    ]
+    return replace(yard, walkers=tuple(walkers))
 
 
 def write_boxes(

@@ -4,13 +4,11 @@ import csv
 import json
 import subprocess
 import sys
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from samples.detector import write_boxes
-from samples.people import Yard, crossing
+from samples.detector import passing, write_boxes
 from tests.test_gaussian import covariance
 from visfuse_cli.fusing.shares import _as_one
 from visfuse_cli.maths import gaussian, joint_association
@@ -35,18 +33,6 @@ def test_the_one_measurement_does_what_all_boxes_do_by_their_shares():
 
 
 SEEDS = (0, 1)
-
-
-def passing(seed: int) -> Yard:
-    """Two people who go the same way for eight seconds and change sides again and again."""
-    yard = crossing(seed, seconds=8.0, people=2, cameras=3)
-    times, along = np.linspace(0, 8, 6), np.linspace(-2, 2, 6)
-    sides = [np.array([(-1) ** (k + j // 2) for j in range(6)]) for k in range(2)]
-    walkers = [
-        replace(walker, times=times, knots=np.column_stack([along, 0.35 * side]))
-        for walker, side in zip(yard.walkers, sides, strict=True)
-    ]
-    return replace(yard, walkers=tuple(walkers))
 
 
 def test_where_people_pass_each_other_shares_keep_them_apart(tmp_path):
