@@ -59,13 +59,13 @@ def follow(clip: Clip, run_: Run, spool: TrackSpool, findings: Findings, first_i
     """Follow everything in one clip; returns the next free id."""
     findings.ledger.drawn[clip.name] = []
     strangers = findings.strangers[clip.name] = Strangers(clip.camera)
-    with helper() as hand_over:
+    with helper() as look_over, helper() as follow_corners:
         with run_.stage("warm up"):
             empty = _empty_scene(clip.source, clip.config.background.warmup_s)
             give_back()
             watch = findings.watches[clip.name] = CameraWatch(empty)
-            look, lamps = _detector(clip, empty, hand_over), Headlights(empty, clip.camera)
-        tracker = GroundTracker(clip.camera, clip.config, first_id, hand_over)
+            look, lamps = _detector(clip, empty, look_over), Headlights(empty, clip.camera)
+        tracker = GroundTracker(clip.camera, clip.config, first_id, follow_corners)
         of = Recording(clip.name, label, clip.camera, findings.began[clip.name], watch.image_from_rest)
         for frame, following in with_next(_steadied(clip.source, watch, run_)):
             tracker.predict(frame.t)
