@@ -98,7 +98,9 @@ def passed(seed: int, association: str) -> tuple[float, float, int]:
     for frame, there in truth.items():
         ids, here = list(places.get(frame, {})), np.array(list(places.get(frame, {}).values())).reshape(-1, 2)
         apart = np.linalg.norm(np.array(there)[:, None] - here[None], axis=-1)
-        pairs = [(i, j) for i, j in zip(*linear_sum_assignment(apart), strict=True) if apart[i, j] < GATE_M]
+        held = np.array([[last.get(i) == k for k in ids] for i in range(len(there))]).reshape(apart.shape)
+        cost = np.where(apart < GATE_M, apart - held, 1e3)  # who was paired stays so while it is near enough
+        pairs = [(i, j) for i, j in zip(*linear_sum_assignment(cost), strict=True) if apart[i, j] < GATE_M]
         exchanged += sum(last.get(i, ids[j]) != ids[j] for i, j in pairs)
         last |= {i: ids[j] for i, j in pairs}
         errors += [apart[i, j] for i, j in pairs]

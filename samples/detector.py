@@ -20,13 +20,13 @@ REACH_M = 4.0
 
 
 def passing(seed: int) -> Yard:
-    """Two people who go the same way for eight seconds and change sides again and again."""
+    """Two people who go the same way for eight seconds, one half a metre ahead, and change sides again and again."""
     yard = crossing(seed, seconds=8.0, people=2, cameras=3)
     times, along = np.linspace(0, 8, 6), np.linspace(-2, 2, 6)
     sides = [np.array([(-1) ** (k + j // 2) for j in range(6)]) for k in range(2)]
     walkers = [
-        replace(walker, times=times, knots=np.column_stack([along, 0.35 * side]))
-        for walker, side in zip(yard.walkers, sides, strict=True)
+        replace(walker, times=times, knots=np.column_stack([along + ahead, 0.35 * side]))
+        for walker, side, ahead in zip(yard.walkers, sides, (-0.25, 0.25), strict=True)
     ]
     return replace(yard, walkers=tuple(walkers))
 
