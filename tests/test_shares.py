@@ -22,7 +22,7 @@ def test_the_one_measurement_does_what_all_boxes_do_by_their_shares():
         prior = Gaussian(rng.normal(size=4), covariance(rng, 4))
         R, share = covariance(rng, 2), 0.9 * rng.dirichlet(np.ones(4))
         spread = prior.cov[:2, :2]
-        z = prior.mean[:2] + 0.5 * rng.normal(size=(4, 2)) @ np.linalg.cholesky(spread + R).T
+        z = prior.mean[:2] + 0.3 * rng.normal(size=(4, 2)) @ np.linalg.cholesky(spread + R).T
         whole = joint_association.update(
             Gaussian(prior.mean[None], prior.cov[None]), z, H, R, np.append(share, 1 - share.sum())[None]
         )

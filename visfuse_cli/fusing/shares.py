@@ -17,7 +17,8 @@ from visfuse_cli.maths.gaussian import log_density, mahalanobis, transpose
 from visfuse_cli.records import Array, Gaussian, Sighting
 from visfuse_cli.vision.matching import Boxes
 
-LEAST_SHARE = 0.05  # of the boxes near somebody: with less that one is as good as not seen
+LEAST_SHARE = 0.5  # of the boxes near somebody: with less that one is not seen, and a track without its person ends
+MARGIN, VAGUE = 0.1, 0.5  # of a picture's size: how far outside, and how doubtfully, somebody may be expected
 CLAIMED = 0.5  # share of a box that people have between them from which on it begins nobody
 
 
@@ -33,7 +34,7 @@ def shared(
     for camera in np.unique(boxes.camera):
         rows = np.flatnonzero(boxes.camera == camera)
         expected, spread = _expected(P[camera], beliefs, dt[rows[0]])
-        share = _shares(boxes, rows, expected, spread, float(np.prod(size[camera])), config)
+        share = _shares(boxes, rows, expected, spread, size[camera], config)
         claimed[rows] = share[:, :-1].sum(axis=0)
         for k in np.flatnonzero(1 - share[:, -1] > LEAST_SHARE):
             best = rows[np.argmax(share[k, :-1])]
@@ -51,7 +52,7 @@ def _expected(P: Array, beliefs: Gaussian, dt: float) -> tuple[Array, Array]:
 
 
 def _shares(
-    boxes: Boxes, rows: NDArray[np.intp], expected: Array, spread: Array, area: float, config: FuseConfig
+    boxes: Boxes, rows: NDArray[np.intp], expected: Array, spread: Array, size: Array, config: FuseConfig
 ) -> Array:
     """Probabilities (T, n + 1) that a person's box is the j-th of one camera's `rows`; the last: that it has none."""
     person, sight = config.person, config.sight
@@ -59,13 +60,16 @@ def _shares(
     S = spread[:, None] + boxes.R[rows]
     taller = boxes.height[rows] - person.height
     variance = boxes.height_sigma[rows] ** 2 + person.height_sigma**2
-    seen = np.asarray(np.isfinite(residual).all(axis=-1))
+    # Whom the camera passes closely, or who is far out of its picture, is not where a Jacobian says.
+    aside = np.abs(np.nan_to_num(expected, nan=np.inf) - size / 2) > (0.5 + MARGIN) * size
+    vague = np.trace(spread, axis1=-2, axis2=-1) > (VAGUE * size.max()) ** 2
+    seen = np.isfinite(residual).all(axis=-1) & ~(aside.any(axis=-1) | vague)[:, None]
     residual = np.where(seen[..., None], residual, 0.0)
     distance = np.where(seen, mahalanobis(residual, S) + taller**2 / variance, np.inf)
     log_likelihood = log_density(residual, S) - 0.5 * (taller**2 / variance + np.log(2 * np.pi * variance))
     near = distance < gate_size(3, sight.gate)
     # Boxes of nobody may be anywhere in the picture and as tall as people can be.
-    clutter = sight.false_boxes / (area * (person.tallest - person.shortest))
+    clutter = sight.false_boxes / (float(np.prod(size)) * (person.tallest - person.shortest))
     return joint_association.probabilities(np.where(near, log_likelihood, -np.inf), sight.detected, clutter)
 
 
@@ -82,7 +86,8 @@ def _as_one(residual: Array, R: Array, spread: Array, share: Array) -> tuple[Arr
     mean = share @ white
     left = share.sum() * np.eye(2) - (share[:, None] * white).T @ white + np.outer(mean, mean)
     values, vectors = np.linalg.eigh(left)
-    # Where the boxes are so far apart that they leave more doubt than there was, they tell as good as nothing.
-    values = np.clip(values, LEAST_SHARE, 1.0)
+    # Boxes far apart leave more doubt than there was, which no measurement can say: it never lies further off than
+    # twice their mean, so that it does no harm to a belief other than this one, as in the pass backwards.
+    values = np.clip(values, share.sum() / 2, 1.0)
     whole = root @ vectors / np.sqrt(values)
     return whole @ (whole.T @ np.linalg.solve(root.T, mean)), whole @ whole.T - spread
