@@ -23,7 +23,7 @@ from visfuse_cli.tracking.scan import headings, scan, velocity_of
 from visfuse_cli.tracking.settings import TrackerSettings
 from visfuse_cli.tracking.targets import Abandoned, Sample, Track
 from visfuse_cli.vision import wireframe
-from visfuse_cli.vision.points import Courses, MovingPoints
+from visfuse_cli.vision.points import Courses, Moves, MovingPoints
 from visfuse_cli.vision.wireframe import DIRECTIONS, Outlines
 
 SCAN_S = 0.3  # s between searches inside of regions
@@ -67,6 +67,11 @@ class Nursery:
             paint = evidence.paint()
             self._watched()
             self._watched = self._hand_over(lambda: self._points.follow(picture, t, paint))
+
+    def moves(self) -> Moves:
+        """How the corners of what moves went to the present frame."""
+        self._watched()
+        return self._points.moves()
 
     def feed(self, frame: int, t: float, regions: list[Region]) -> None:
         """Give the frame's unexplained regions to candidates, new ones where none fits."""
@@ -151,11 +156,11 @@ class Nursery:
         regions = evidence.leftovers(*taken)
         found = claim(regions, expected[None])[0]
         if found >= 0:
-            guess = best_guess(self._camera, self._settings, evidence, regions[found], float(box[2]), taken)
+            guess = best_guess(self._camera, self._settings, evidence, regions[found], float(box[2]), taken, False)
             guesses += [guess] if guess is not None else []
         if isinstance(evidence, LabelEvidence):
             place = np.append(expected[:2], expected[2:] - expected[:2])
-            guesses += scan(self._camera, self._settings, evidence, place, np.inf, float(box[2]), taken)
+            guesses += scan(self._camera, self._settings, evidence, place, np.inf, float(box[2]), taken, False)
         here = [
             g for g in guesses if footprint_overlap(g.pose[None], g.size[None], box[None, :3], box[None, 3:])[0, 0] > 0
         ]
@@ -228,11 +233,12 @@ class Nursery:
         recent: Recent,
         taken_at: Callable[[int], Boxes],
         earlier: list[Track],
+        beyond_doubt: bool = True,
     ) -> Track | None:
         """A track from what was guessed in the last frame, followed back and joined to the one of the `earlier` tracks
         that it goes on from; that one is taken out of the list. None when it was hardly seen before."""
         camera, settings = self._camera, self._settings
-        samples, pose = trace(camera, settings, self._dynamics, recent, taken_at, guess, velocity)
+        samples, pose = trace(camera, settings, self._dynamics, recent, taken_at, guess, velocity, beyond_doubt)
         used = np.array([sample.measured for sample in samples], dtype=bool)
         if used.sum() < settings.life.confirm_frames or used.mean() < SEEN:
             return None
@@ -241,10 +247,13 @@ class Nursery:
         for old in earlier:
             before = part_before(old, self._dynamics, samples, pose, guess.size)
             if before is not None:
-                samples, pose = before[0] + samples, np.concatenate([before[1], pose])
-                identity = old.id
                 earlier.remove(old)
-                break
+                return self._track(old.id, before[0] + samples, np.concatenate([before[1], pose]))
+        return self._track(identity, samples, pose)
+
+    def _track(self, identity: int, samples: list[Sample], pose: Array) -> Track:
+        """A track from its samples so far, its poses (n, 3) in them being roughly known."""
+        camera, settings = self._camera, self._settings
         used = np.array([sample.measured for sample in samples], dtype=bool)
         outlines = Outlines.stack([sample.outline for sample in samples])
         sized = measure.classify(camera, outlines[used], pose[used], settings.target.classes, settings.pose)[0]

@@ -44,7 +44,7 @@ class Path:
     size: Array
     size_sigma: Array
     size_pull: Array
-    size_z: float  # how many deviations the size lies from its class, at worst
+    size_z: float  # how many deviations the size lies from its class, all three together
     calibration: Array
     pixel: Array
     nis: Array
@@ -124,7 +124,7 @@ def _ahead(steps: list[Step], dynamics: Dynamics, latency: float, length: float)
 def _size_z(size: Array, class_name: str, settings: TrackerSettings) -> float:
     prior = next(c for c in settings.target.classes if c.name == class_name)
     mean, sigma = measure.prior_arrays(prior)
-    return float(np.max(np.abs(size - mean) / sigma))
+    return float(np.linalg.norm((size - mean) / sigma))
 
 
 def _nis(steps: list[Step]) -> Array:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -16,6 +16,7 @@ from visfuse_cli.tracking.settings import FilterSettings, TargetSettings
 WHEELBASE_SHARE = 0.6  # of a vehicle's length
 COURSES = (course.CSD, course.CS, course.CD)  # Bradshaw 1997, sec. 4.1
 QUIET = 0.2  # of the usual noise: what a motion that holds its speed still has
+BELIEVED_SIGMA = 4.0  # a speed further from the expected one is something else's
 STRAIGHT = 0.02  # rad/s per root Hz: what one that holds its course still has
 
 
@@ -248,6 +249,22 @@ def take(dynamics: Dynamics, prediction: Prediction, z: Array, R: Array) -> Step
     taken = fading.update(prediction.prior, prediction.Q, gamma, dynamics.H, R, memory, dynamics.alpha, limit=limit)
     posterior = Gaussian(wrap_at(taken.posterior.mean, dynamics.angles_x), taken.posterior.cov)
     return Step(taken.prior, posterior, prediction.F, taken.innovation, taken.state)
+
+
+def take_speed(dynamics: Dynamics, step: Step, along: Array, speed: float, sigma: float) -> Step:
+    """Take in the speed (m/s, deviation sigma) of one target along a direction (2,), unless it is beyond belief."""
+    belief = step.posterior if step.models is None else step.models.filtered.beliefs
+    planar, J = dynamics.planar(belief.mean)
+    H = (along @ J[..., 2:, :])[..., None, :]
+    residual = (speed - planar[..., 2:] @ along)[..., None]
+    posterior, innovation = gaussian.update(belief, residual, H, np.array([[sigma**2]]))
+    if np.min(innovation.nis) > BELIEVED_SIGMA**2:
+        return step
+    if step.models is None:
+        return replace(step, posterior=posterior)
+    log_mu = imm.weigh(step.models.filtered.log_mu, innovation.log_likelihood)
+    models = replace(step.models, filtered=imm.Bank(posterior, log_mu))
+    return replace(step, posterior=imm.combined(models.filtered, dynamics.angles_x), models=models)
 
 
 def smooth(dynamics: Dynamics, steps: Sequence[Step]) -> Gaussian:

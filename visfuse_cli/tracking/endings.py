@@ -10,7 +10,7 @@ from visfuse_cli.tracking import dynamics as dynamics_tools
 from visfuse_cli.tracking.association import footprint_overlap
 from visfuse_cli.tracking.dynamics import Dynamics
 from visfuse_cli.tracking.evidence import Boxes
-from visfuse_cli.tracking.lookback import LEAST_OPEN
+from visfuse_cli.tracking.hypotheses import LEAST_OPEN
 from visfuse_cli.tracking.settings import LifeSettings
 from visfuse_cli.tracking.targets import Track
 from visfuse_cli.tracking.zones import Region

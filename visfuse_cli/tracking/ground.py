@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from bisect import bisect_left
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 
 import numpy as np
@@ -15,16 +15,16 @@ from visfuse_cli.maths.gaussian import mahalanobis
 from visfuse_cli.records import Array, GroundCamera
 from visfuse_cli.records import Region as ImageRegion
 from visfuse_cli.tracking import dynamics as dynamics_tools
-from visfuse_cli.tracking import endings, measure
+from visfuse_cli.tracking import endings, measure, texture
 from visfuse_cli.tracking.association import footprint_overlap
 from visfuse_cli.tracking.births import Nursery
 from visfuse_cli.tracking.dynamics import Dynamics, Prediction, Step
 from visfuse_cli.tracking.elsewhere import HandOver, at_once
 from visfuse_cli.tracking.endings import ONE_PLACE, trimmed
 from visfuse_cli.tracking.evidence import Boxes, Evidence
-from visfuse_cli.tracking.hypotheses import Guess, gain_of
+from visfuse_cli.tracking.hypotheses import LEAST_OPEN, Guess, gains
 from visfuse_cli.tracking.joining import WAIT_S
-from visfuse_cli.tracking.lookback import LEAST_OPEN, Recent
+from visfuse_cli.tracking.lookback import Recent
 from visfuse_cli.tracking.settings import TrackerSettings
 from visfuse_cli.tracking.targets import Abandoned, Comparison, Sample, Track
 from visfuse_cli.tracking.zones import Region
@@ -36,9 +36,9 @@ SEEN_SHARE = 0.4  # of the unhidden area of a box that must have moved and of it
 LIKENESS_S = 0.4  # s over which the share of the border that is found is averaged
 DOUBTFUL, MOVED_M = 0.25, 2.0  # share of the border that is not clear, to compare, and again so many m further
 WAIT_AT_MOST_S = 4.0  # before a doubtful track is compared again
-KEPT = 0.9  # of its frames and of the outline seen in them a track keeps when its box is exchanged
-BETTER, MUCH_BETTER = 1.2, 2.0  # times as much must another box explain, and to be taken though seen for less time
+BETTER, COMPARED = 1.2, 8  # times as much must another box explain, over so many of the last frames
 LOOK_BACK_FRAMES = 120  # at most
+HIDDEN = 0.8  # of a box in view, below which the corners on it are asked how fast it goes
 REACH_PX, REACH_SHARE = (4.0, 24.0), 0.2  # how far from its prediction an outline is looked for; of its height
 BESIDE_M = 6.0  # m between two tracks that may be parts of one vehicle
 
@@ -145,6 +145,10 @@ class GroundTracker:
         border = np.where(np.isnan(look.likeness), look.border, look.likeness) * fit.agreed
         there = fit.ok & measure.looks_right(fit, look.outlines) & (look.moved > SEEN_SHARE) & ~(border < SEEN_SHARE)
         there &= look.open > LEAST_OPEN
+        along = np.column_stack([np.cos(pose[:, 2]), np.sin(pose[:, 2])])
+        velocity = np.array([self.dynamics.planar(expected.prior.mean)[0][2:] for expected in self._expected])
+        moves = self._nursery.moves()
+        pace, doubt = texture.paces(self.camera, pose, size, np.sum(velocity * along, axis=1), moves)
         for k, track in enumerate(self.tracks):
             step = dynamics_tools.coast(self._expected[k])
             if np.isfinite(border[k]):
@@ -163,6 +167,8 @@ class GroundTracker:
                 else:
                     track.refused += 1
                     track.refused_since = sample.t if track.refused_since is None else track.refused_since
+            if look.open[k] < HIDDEN and np.isfinite(pace[k]):
+                step = dynamics_tools.take_speed(self.dynamics, step, along[k], pace[k], doubt[k])
             track.samples.append(sample)
             track.steps.append(step)
 
@@ -180,31 +186,37 @@ class GroundTracker:
         guess = self._nursery.rival(evidence, box, self._boxes_at(frame, without=[track, *parts]))
         if guess is None:
             return
-        parts = [part for part in parts if self._shares_place(part, guess)]
-        replaced = [track, *parts]
-        taken = self._boxes_at(frame, without=replaced)
-        explained = [
-            gain_of(
-                self.camera,
-                evidence,
-                dynamics_tools.pose(self.dynamics, each.steps[-1].posterior.mean),
-                each.size,
-                taken,
-            )
-            for each in replaced
-        ]
-        times = guess.gain / max(float(np.nansum(explained)), 1e-9)
-        if not times > BETTER:
+        replaced = [track, *(part for part in parts if self._shares_place(part, guess))]
+        before = partial(self._boxes_at, without=replaced)
+        lately = list(self._recent)[:: -max(1, len(self._recent) // COMPARED)]
+        if guess.gain < self._explained(replaced, before, lately[:1]):
             return
         velocity = self.dynamics.planar(track.steps[-1].posterior.mean)[0][2:]
-        before = partial(self._boxes_at, without=replaced)
-        itself = [track]
-        better = self._nursery.grown(guess, velocity, track.id, self._recent, before, itself)
-        if better is not None and not itself and (times > MUCH_BETTER or _as_good(better, track)):
-            better.compared = track.compared
-            self.tracks[self.tracks.index(track)] = better
-            self.tracks = [each for each in self.tracks if not any(each is part for part in parts)]
-            self._held += [trimmed(part, f"part of track {track.id}") for part in parts]
+        gone = sorted(replaced, key=lambda each: -len(each.samples))
+        better = self._nursery.grown(guess, velocity, track.id, self._recent, before, gone, False)
+        if better is None:
+            return
+        if self._explained([better], before, lately) < BETTER * self._explained(replaced, before, lately):
+            return
+        better.compared = track.compared
+        self.tracks[self.tracks.index(track)] = better
+        self.tracks = [each for each in self.tracks if not any(each is part for part in replaced)]
+        self._held += [trimmed(each, f"part of track {better.id}") for each in gone if each.id != better.id]
+
+    def _explained(
+        self, tracks: list[Track], others: Callable[[int], Boxes], lately: list[tuple[int, float, Evidence]]
+    ) -> float:
+        """How much of some of the last frames a few tracks explain, each as if it alone stood among the others."""
+        looked_at = {frame: evidence for frame, _, evidence in lately}
+        total = 0.0
+        for track in tracks:
+            common = [k for k, sample in enumerate(track.samples) if sample.frame in looked_at]
+            frames = [track.samples[k].frame for k in common]
+            pose = np.array([dynamics_tools.pose(self.dynamics, track.steps[k].posterior.mean) for k in common])
+            size = np.tile(track.size, (len(common), 1))
+            taken = [others(frame) for frame in frames]
+            total += float(np.nansum(gains(self.camera, [looked_at[frame] for frame in frames], pose, size, taken)))
+        return total
 
     def _doubtful_beside(self, track: Track) -> list[Track]:
         """The other tracks near enough to be a part of the same vehicle, none of them sure."""
@@ -274,10 +286,3 @@ class GroundTracker:
         ended = [trimmed(track, why) for track, why in zip(self.tracks, reasons, strict=True) if why]
         self.tracks = [track for track, why in zip(self.tracks, reasons, strict=True) if not why]
         return ended
-
-
-def _as_good(new: Track, old: Track) -> bool:
-    """Whether a track goes back nearly as far as the one whose place it takes and is seen as clearly."""
-    begin = new.samples[0].frame
-    seen = [[s.border for s in track.samples if s.frame >= begin and s.border >= 0] for track in (new, old)]
-    return len(new.samples) > KEPT * len(old.samples) and bool(np.sum(seen[0]) > KEPT * np.sum(seen[1]))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,7 +13,7 @@ from visfuse_cli.maths.cameras import project
 from visfuse_cli.records import Array, GroundCamera, Region
 from visfuse_cli.tracking import measure
 from visfuse_cli.tracking.association import footprint_overlap
-from visfuse_cli.tracking.evidence import Boxes, Evidence
+from visfuse_cli.tracking.evidence import Boxes, Evidence, probe_each
 from visfuse_cli.tracking.settings import SizePrior, TrackerSettings
 from visfuse_cli.vision import wireframe
 from visfuse_cli.vision.contour import Look
@@ -22,6 +23,7 @@ REACHES_PX = (24.0, 12.0, 6.0)  # how far around a hypothesis its border is look
 BORDER_SEEN, AREA_MOVED = 0.6, 0.6  # shares of its border and its area that must be found
 CLEAR = 0.4  # share of its border that must have background outside: a window of a grey car has paint
 FOOT_SEEN = 0.5  # share of its border on the ground that must be found: a part of a vehicle stands on nothing
+LEAST_OPEN = 0.2  # of a box in view to measure it
 OPEN, SHOWN = 0.5, 0.45  # of its area that must be in view, and of all of its border that must be found
 ONE_PLACE = 0.25  # of a footprint that may lie in another's
 PART = 0.3  # how much more of these is wanted of a box that explains next to nothing
@@ -48,7 +50,13 @@ class Guess:
 
 
 def best_guess(
-    camera: GroundCamera, settings: TrackerSettings, evidence: Evidence, region: Region, heading: float, taken: Boxes
+    camera: GroundCamera,
+    settings: TrackerSettings,
+    evidence: Evidence,
+    region: Region,
+    heading: float,
+    taken: Boxes,
+    convincing: bool = True,
 ) -> Guess | None:
     """The box that explains most of a region, free of those `taken`; None if none fits.
 
@@ -59,7 +67,7 @@ def best_guess(
     means = [measure.prior_arrays(prior)[0] for prior in settings.target.classes]
     starts = [np.concatenate([_aligned(camera, box, heading, mean) for box in boxes]) for mean in means]
     which = np.repeat(np.arange(len(means)), [len(start) for start in starts])
-    guesses = refined(camera, settings, evidence, which, np.concatenate(starts), region.around_area, taken)
+    guesses = refined(camera, settings, evidence, which, np.concatenate(starts), region.around_area, taken, convincing)
     return max(guesses, key=lambda guess: guess.gain, default=None)
 
 
@@ -71,8 +79,9 @@ def refined(
     pose: Array,
     around_area: float | Array,
     taken: Boxes,
+    convincing: bool = True,
 ) -> list[Guess]:
-    """Boxes of classes `which` (N,) from poses (N, 3) fitted to what is seen, those that convince.
+    """Boxes of classes `which` (N,) from poses (N, 3) fitted to what is seen: those that convince, or all that fit.
 
     around_area (N,) px^2 is how much moves there and wants to be explained.
     """
@@ -99,7 +108,8 @@ def refined(
         & (look.outlines.tangent | (look.outlines.valid.mean(axis=1) > SHOWN))
     )
     stands &= ~np.any(footprint_overlap(pose, size, *taken) > ONE_PLACE, axis=1)
-    good = fit.ok & usual & measure.looks_right(fit, look.outlines) & clear & (look.moved > AREA_MOVED) & stands
+    good = fit.ok & usual & measure.looks_right(fit, look.outlines) & (look.moved > AREA_MOVED)
+    good &= (clear & stands) if convincing else (look.open > LEAST_OPEN)
     gain = _gain(look, area)
     good &= gain > 0
     gain = gain * np.exp(-USUAL_WEIGHT * np.sum(((size - mean) / sigma) ** 2, axis=1))
@@ -111,10 +121,10 @@ def _moved(fit: BoxFit, pose: Array, size: Array) -> tuple[Array, Array]:
     return np.where(fit.ok[:, None], fit.pose, pose), np.where(fit.ok[:, None], fit.size, size)
 
 
-def gain_of(camera: GroundCamera, evidence: Evidence, pose: Array, size: Array, taken: Boxes) -> float:
-    """How much one box with pose (3,) and size (3,) explains, as `Guess.gain`; NaN where it is hidden."""
-    look = evidence.probe(pose[None], size[None], np.array(REACHES_PX[-1:]), taken)
-    return float(_gain(look, area_of(camera, pose[None], size[None]) * look.open)[0])
+def gains(camera: GroundCamera, frames: Sequence[Evidence], pose: Array, size: Array, taken: list[Boxes]) -> Array:
+    """How much (N,) N boxes explain, each in a frame of its own, as `Guess.gain`; NaN where one is hidden."""
+    look = probe_each(frames, pose, size, np.full(len(pose), REACHES_PX[-1]), taken)
+    return _gain(look, area_of(camera, pose, size) * look.open)
 
 
 def _gain(look: Look, area: Array) -> Array:
@@ -123,9 +133,9 @@ def _gain(look: Look, area: Array) -> Array:
     return area**LARGER * filled * look.likeness**SHARPER * amidst**CROSSING
 
 
-def convincing(look: Look) -> NDArray[np.bool_]:
-    """Which (N,) of the boxes followed back are seen beyond doubt."""
-    clear = (look.clear > CLEAR) | (look.paint > SOLID)
+def seen(look: Look, beyond_doubt: bool) -> NDArray[np.bool_]:
+    """Which (N,) of the boxes followed back are seen: beyond doubt, or as well as can be amidst others."""
+    clear = (look.border + look.clear > BORDER_SEEN + CLEAR) | (look.paint > SOLID) | (not beyond_doubt)
     return np.asarray((look.border > BORDER_SEEN) & (look.moved > AREA_MOVED) & clear)
 
 

@@ -11,16 +11,13 @@ from visfuse_cli.tracking.targets import Sample, Track
 
 CLOSE_M = 2.0  # between the places that both have for one moment
 DRIFT = 0.2  # m a metre driven unseen: drivers brake and accelerate
-ASIDE_M, TURNED = 1.5, 0.5  # m off the course and rad turned, while unseen
-HALF = 0.5  # of its length: a part of a vehicle that was followed as one lies that far off
+ASIDE_M, TURNED = 1.5, 0.7  # m off the course and rad turned, while unseen
+PART = 0.4  # of both lengths: a part of a vehicle that was followed as one lies that far off
 SAME = 0.5  # share of the common frames in which one stands in the place of the other
 BELIEVED = 0.7  # share of the outline seen, on average, that makes an earlier stretch worth keeping
 WAIT_S = 3.0, 6.0  # s unseen, of what moves and of what stands in a queue
-SLOW, STARTS, ALIKE = (
-    2.0,
-    1.0,
-    0.25,
-)  # m/s below which it stands; m/s^2 that it starts with; of the logarithm of its length
+SLOW, STARTS = 2.0, 1.0  # m/s below which it stands, and m/s^2 that it starts with
+ALIKE = 0.25  # of the logarithm of its length
 
 
 def part_before(
@@ -39,24 +36,29 @@ def part_before(
         index = {sample.frame: k for k, sample in enumerate(samples)}
         common = [(k, index[s.frame]) for k, s in enumerate(old.samples) if s.frame in index]
         mine, its = np.array(common).T
-        apart = np.linalg.norm(place[mine, :2] - pose[its, :2], axis=1)
+        apart = place[mine, :2] - pose[its, :2]
+        ahead = np.column_stack([np.cos(pose[its, 2]), np.sin(pose[its, 2])])
+        along, across = np.sum(apart * ahead, axis=1), ahead[:, 0] * apart[:, 1] - ahead[:, 1] * apart[:, 0]
         turned = np.abs(wrap(place[mine, 2] - pose[its, 2]))
-        if np.mean((apart < max(CLOSE_M, HALF * size[0])) & (turned < TURNED)) < SAME:
+        same = (np.abs(along) < max(CLOSE_M, PART * (size[0] + old.size[0]))) & (turned < TURNED)
+        same &= np.abs(across) < ASIDE_M
+        # whatever the earlier one did in the end, or was too late to do
+        fits = count > 0 and float(np.hypot(*apart[0])) < CLOSE_M
+        if np.mean(same) < SAME and not fits:
             return None
-        fits = count > 0 and apart[0] < CLOSE_M
     else:
         gap = begin.t - old.samples[-1].t
         planar, _ = dynamics.planar(was[-1])
         speed = max(float(np.hypot(*planar[2:])), 1e-6)
         slow = speed < SLOW  # what hardly moves goes where it faces
-        ahead = np.array([np.cos(place[-1, 2]), np.sin(place[-1, 2])]) if slow else planar[2:] / speed
+        way = np.array([np.cos(place[-1, 2]), np.sin(place[-1, 2])]) if slow else planar[2:] / speed
         offset = pose[0, :2] - planar[:2] - gap * planar[2:]
-        along, across = float(offset @ ahead), float(ahead[0] * offset[1] - ahead[1] * offset[0])
-        turned = abs(wrap(pose[0, 2] - np.arctan2(ahead[1], ahead[0])))
-        ahead_m = CLOSE_M + DRIFT * gap * speed
-        near = -ahead_m < along < ahead_m + slow * STARTS * gap**2 / 2 and abs(across) < ASIDE_M and turned < TURNED
+        on, off = float(offset @ way), float(way[0] * offset[1] - way[1] * offset[0])
+        turn = abs(wrap(pose[0, 2] - np.arctan2(way[1], way[0])))
+        reach = CLOSE_M + DRIFT * gap * speed
+        near = -reach < on < reach + slow * STARTS * gap**2 / 2 and abs(off) < ASIDE_M and turn < TURNED
         alike = abs(np.log(size[0] / old.size[0])) < ALIKE
-        fits = good and near and (gap < WAIT_S[0] or (slow and alike and gap < WAIT_S[1]))
+        fits = bool(near and (gap < WAIT_S[0] or (slow and alike and gap < WAIT_S[1])))
         if not fits:
             return None
     return (kept, place[:count]) if fits and good else ([], np.zeros((0, 3)))

@@ -21,7 +21,6 @@ from visfuse_cli.tracking.targets import Sample
 from visfuse_cli.vision import wireframe
 
 REACH_PX = (4.0, 20.0)
-LEAST_OPEN = 0.2  # of a box in view to measure it
 PROOF, PROVEN = 10, 0.5  # frames after which a thing that was seen in few of them is none
 AT_ONCE = 5  # frames that are looked at together: what is expected in them differs little
 LOST_S = 0.3  # s without the thing: it was not there before
@@ -37,12 +36,13 @@ def trace(
     taken_at: Callable[[int], Boxes],
     guess: Guess,
     velocity: Array,
+    beyond_doubt: bool = True,
 ) -> tuple[list[Sample], Array]:
     """Samples of a thing from where it was first seen to the last frame of `recent`, and its poses there (n, 3).
 
     Time runs backwards: to the motion model it is the same thing driving away the other way round.
     """
-    way = _Way(camera, settings, dynamics, guess, velocity, recent[-1][1])
+    way = _Way(camera, settings, dynamics, guess, velocity, recent[-1][1], beyond_doubt)
     frames = list(reversed(recent))
     for first in range(0, len(frames), AT_ONCE):
         if not way.follow(frames[first : first + AT_ONCE], taken_at):
@@ -61,7 +61,9 @@ class _Way:
         guess: Guess,
         velocity: Array,
         t: float,
+        beyond_doubt: bool,
     ) -> None:
+        self._beyond_doubt = beyond_doubt
         self._camera, self._settings, self._dynamics, self._guess = camera, settings, dynamics, guess
         turned = np.array([guess.pose[0], guess.pose[1], guess.pose[2] + np.pi])
         self._step = dynamics_tools.first(dynamics, dynamics.begin(turned, -velocity))
@@ -85,8 +87,8 @@ class _Way:
         taken = [taken_at(frame) for frame, _, _ in frames]
         look = probe_each([evidence for *_, evidence in frames], pose, size, reach, taken)
         fit = measure.fit_poses(self._camera, look.outlines, pose, size, self._guess.size_sigma, self._settings.pose)
-        there = fit.ok & measure.looks_right(fit, look.outlines) & hypotheses.convincing(look)
-        there &= look.open > LEAST_OPEN
+        there = fit.ok & measure.looks_right(fit, look.outlines) & hypotheses.seen(look, self._beyond_doubt)
+        there &= look.open > hypotheses.LEAST_OPEN
         border = look.border * fit.agreed
         for k, (frame, t, _) in enumerate(frames):
             if self._last_seen - t > LOST_S:

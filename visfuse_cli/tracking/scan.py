@@ -34,6 +34,7 @@ def scan(
     moving_area: float,
     heading: float,
     taken: Boxes,
+    convincing: bool = True,
 ) -> list[Guess]:
     """Vehicles with a heading (rad) whose middle may stand in an image box [x, y, w, h] (4,), of which `moving_area`
     px^2 moves."""
@@ -43,7 +44,7 @@ def scan(
         return []
     car = measure.prior_arrays(settings.target.classes[0])[0]
     whole = np.minimum(hypotheses.area_of(camera, pose, np.tile(car, (len(pose), 1))), moving_area)
-    return hypotheses.refined(camera, settings, evidence, which, pose, whole, taken)
+    return hypotheses.refined(camera, settings, evidence, which, pose, whole, taken, convincing)
 
 
 def headings(course: Array) -> list[float]:

@@ -34,7 +34,7 @@ class SpeedSettings(Section):
     max_sigma: float = Field(0.15, gt=0, le=10, description="standard deviation over speed: above, too uncertain")
     max_acceleration: float = Field(9.0, gt=0, le=100, description="m/s^2: above, the track has jumped")
     min_evidence: float = Field(
-        1.54,
+        1.53,
         ge=0,
         le=3,
         description="share of its outline that was found, of what could be seen plus of all of it, plus 0.22 times the "
@@ -42,7 +42,7 @@ class SpeedSettings(Section):
     )
     min_measured: float = Field(0.6, ge=0, le=1, description="share of a track's frames that must be measured")
     max_misfit: float = Field(0.2, gt=0, le=5, description="outline misfit over outline size: above, no such box")
-    max_size_z: float = Field(5.0, gt=0, le=100, description="deviations of a size from its class")
+    max_size_z: float = Field(5.5, gt=0, le=100, description="deviations of a size from its class, all three together")
     max_refused: float = Field(
         0.5, gt=0, le=1, description="share of measurements outside the gate: above, inconsistent"
     )

@@ -23,6 +23,15 @@ NOW_S = 0.3  # s over which its present velocity is smoothed
 
 
 @dataclass(frozen=True, slots=True)
+class Moves:
+    """Where (n, 2) px corners were in the picture before this one and are now, `dt` s later."""
+
+    before: Array
+    now: Array
+    dt: float
+
+
+@dataclass(frozen=True, slots=True)
 class Courses:
     """Corners that have moved: place (n, 2) px, velocity (n, 2) m/s and course (n,) rad when they last moved.
 
@@ -45,6 +54,7 @@ class MovingPoints:
         self._scale = max(1.0, camera.image_size[0] / WIDTH_PX)
         self._last: Image | None = None
         self._place = np.zeros((0, 2), np.float32)  # px of the small picture
+        self._moves = Moves(np.zeros((0, 2)), np.zeros((0, 2)), 1.0)
         self._ground = np.zeros((0, 2))  # m
         self._velocity = np.zeros((0, 2))  # m/s, smoothed; NaN before the second picture
         self._anchor = np.zeros((0, 4))  # u, v, X, Y from which the present stretch is counted
@@ -57,7 +67,9 @@ class MovingPoints:
         small = cv2.resize(picture, size, interpolation=cv2.INTER_AREA) if self._scale > 1 else picture
         mask = cv2.resize(wanted, size, interpolation=cv2.INTER_NEAREST) if self._scale > 1 else wanted
         if len(self._place) and self._last is not None:
-            self._advance(small, mask)
+            before = self._pixels()
+            kept = self._advance(small, mask)
+            self._moves = Moves(before[kept], self._pixels(), max(t - self._t, 1e-6))
             self._tell(t)
         if t - self._sought >= SEEK_S:
             self._sought = t
@@ -69,12 +81,17 @@ class MovingPoints:
         known = np.isfinite(self._course) & np.isfinite(self._velocity[:, 0])
         return Courses(self._pixels()[known], self._velocity[known], self._course[known])
 
+    def moves(self) -> Moves:
+        """How the corners went from the picture before the last one to the last one."""
+        return self._moves
+
     def _pixels(self) -> Array:
         pixels = (self._place.astype(float) + 0.5) * self._scale - 0.5
         lens = self._camera.ground.lens
         return pixels if lens is None or not len(pixels) else undistort_points(pixels, lens)
 
-    def _advance(self, small: Image, mask: Image) -> None:
+    def _advance(self, small: Image, mask: Image) -> NDArray[np.bool_]:
+        """Follow the corners into the next picture; which of them are there."""
         assert self._last is not None
         found, status, _ = cv2.calcOpticalFlowPyrLK(
             self._last, small, self._place, None, winSize=WINDOW, maxLevel=LEVELS
@@ -85,6 +102,7 @@ class MovingPoints:
         inside[inside] = mask[v[inside], u[inside]] > 0
         self._place = found
         self._keep(inside)
+        return inside
 
     def _keep(self, which: NDArray[np.bool_]) -> None:
         self._place, self._anchor, self._course = self._place[which], self._anchor[which], self._course[which]

@@ -1,0 +1,77 @@
+"""How fast boxes go by the corners on them: what holds a box in its place where neighbours hide its outline."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from visfuse_cli.maths.cameras import project
+from visfuse_cli.records import Array, GroundCamera
+from visfuse_cli.vision.points import Moves
+
+LEAST = 3  # corners that tell a speed
+CORNER_PX = 0.3  # noise of a corner from picture to picture
+SURFACE = 0.3  # of a speed: corners lie before or behind the sides of a box, and some stay behind what is fast
+SETTLED = 0.1  # m/s: what stands may seem to go
+
+
+def paces(camera: GroundCamera, pose: Array, size: Array, expected: Array, moves: Moves) -> tuple[Array, Array]:
+    """Speed (N,) m/s along their headings and its deviation (N,) of boxes with pose (N, 3), size (N, 3) and an
+    expected speed (N,); NaN of those with too few corners.
+
+    A corner belongs to the side of a box that is nearest along its line of sight, at whose height it moves.
+    """
+    speed, sigma = np.full(len(pose), np.nan), np.full(len(pose), np.nan)
+    if not len(moves.now) or not len(pose):
+        return speed, sigma
+    place, owner = _on_boxes(camera, pose, size, moves.now)
+    ahead = np.stack([np.cos(pose[:, 2]), np.sin(pose[:, 2])], axis=-1)[owner]
+    gone = np.zeros((len(place), 2))
+    for _ in range(2):  # m on the ground for a pixel, half-way
+        _, J = project(camera, place - np.column_stack([gone / 2, np.zeros(len(place))]))
+        way_of = _inverse(J[:, :, :2])
+        gone = np.einsum("nij,nj->ni", way_of, moves.now - moves.before)
+    along = np.sum(gone * ahead, axis=1)
+    aside = ahead[:, 0] * gone[:, 1] - ahead[:, 1] * gone[:, 0]
+    noise = CORNER_PX * np.linalg.norm(np.einsum("ni,nij->nj", ahead, way_of), axis=1)
+    good = (owner >= 0) & (np.abs(aside) < np.abs(along) + 3 * noise)
+    for k in range(len(pose)):
+        mine = good & (owner == k)
+        if np.count_nonzero(mine) < LEAST:
+            continue
+        each = along[mine] / moves.dt
+        middle = float(np.median(each))
+        spread = 1.5 * float(np.median(np.abs(each - middle)))
+        doubt = max(spread, float(np.median(noise[mine])) / moves.dt) / np.sqrt(len(each))
+        surface = SURFACE * max(abs(middle), abs(expected[k]))
+        speed[k], sigma[k] = middle, np.sqrt(doubt**2 + surface**2 + SETTLED**2)
+    return speed, sigma
+
+
+def _inverse(J: Array) -> Array:
+    """Inverses of matrices (n, 2, 2), NaN of those that have none."""
+    det = J[:, 0, 0] * J[:, 1, 1] - J[:, 0, 1] * J[:, 1, 0]
+    flipped = np.stack([J[:, 1, 1], -J[:, 0, 1], -J[:, 1, 0], J[:, 0, 0]], axis=-1).reshape(-1, 2, 2)
+    return np.asarray(flipped / np.where(np.abs(det) > 1e-12, det, np.nan)[:, None, None])
+
+
+def _on_boxes(camera: GroundCamera, pose: Array, size: Array, pixels: Array) -> tuple[Array, Array]:
+    """Where (n, 3) m the lines of sight through pixels (n, 2) first meet a box, and which one (n,); -1: none."""
+    H, centre = camera.ground.ground_from_image, camera.centre
+    foot = np.column_stack([pixels, np.ones(len(pixels))]) @ H.T
+    sight = np.column_stack([foot[:, :2] / foot[:, 2:] - centre[:2], np.full(len(pixels), -centre[2])])
+    c, s = np.cos(pose[:, 2]), np.sin(pose[:, 2])
+    turn = np.stack([np.stack([c, s], axis=-1), np.stack([-s, c], axis=-1)], axis=-2)  # (N, 2, 2) into the box
+    start = np.einsum("nij,nj->ni", turn, centre[:2] - pose[:, :2])
+    start = np.column_stack([start, np.full(len(pose), centre[2])])[:, None]
+    towards = np.einsum("nij,mj->nmi", turn, sight[:, :2])
+    towards = np.concatenate([towards, np.broadcast_to(sight[:, 2:], (*towards.shape[:2], 1))], axis=-1)
+    towards = np.where(np.abs(towards) < 1e-9, 1e-9, towards)
+    low = np.column_stack([-size[:, :2] / 2, np.zeros(len(size))])[:, None]
+    high = np.column_stack([size[:, :2] / 2, size[:, 2]])[:, None]
+    ends = np.stack([(low - start) / towards, (high - start) / towards])
+    enters, leaves = ends.min(axis=0).max(axis=-1), ends.max(axis=0).min(axis=-1)
+    meets = np.where((enters <= leaves) & (enters > 0), enters, np.inf)
+    owner = np.argmin(meets, axis=0)
+    nearest = meets[owner, np.arange(len(pixels))]
+    place = centre + np.where(np.isfinite(nearest), nearest, 0.0)[:, None] * sight
+    return place, np.where(np.isfinite(nearest), owner, -1)
