@@ -104,8 +104,7 @@ class Nursery:
             if track is None:
                 waiting.append(candidate)
             else:
-                tracks.append(track)
-                next_id = max(next_id, track.id + 1)
+                next_id = _added(track, tracks, held, next_id)
         self._candidates = waiting
         return self._scanned(next_id, tracks, held, recent, taken_at)
 
@@ -128,9 +127,7 @@ class Nursery:
                 if (track := self.grown(guess, velocity, next_id, recent, taken_at, held)) is not None
             ]
             if grown:
-                track = max(grown, key=_seen)
-                tracks.append(track)
-                next_id = max(next_id, track.id + 1)
+                next_id = _added(max(grown, key=_seen), tracks, held, next_id)
         return next_id
 
     def _guessed(
@@ -236,7 +233,7 @@ class Nursery:
         beyond_doubt: bool = True,
     ) -> Track | None:
         """A track from what was guessed in the last frame, followed back and joined to the one of the `earlier` tracks
-        that it goes on from; that one is taken out of the list. None when it was hardly seen before."""
+        that it goes on from, whose number it has. None when it was hardly seen before."""
         camera, settings = self._camera, self._settings
         samples, pose = trace(camera, settings, self._dynamics, recent, taken_at, guess, velocity, beyond_doubt)
         used = np.array([sample.measured for sample in samples], dtype=bool)
@@ -247,7 +244,6 @@ class Nursery:
         for old in earlier:
             before = part_before(old, self._dynamics, samples, pose, guess.size)
             if before is not None:
-                earlier.remove(old)
                 return self._track(old.id, before[0] + samples, np.concatenate([before[1], pose]))
         return self._track(identity, samples, pose)
 
@@ -295,6 +291,13 @@ class Nursery:
             else:
                 steps.append(dynamics_tools.coast(expected))
         return steps
+
+
+def _added(track: Track, tracks: list[Track], held: list[Track], next_id: int) -> int:
+    """Add a new track, which takes the place of the one `held` that it goes on from; the next free id."""
+    tracks.append(track)
+    held[:] = [old for old in held if old.id != track.id]
+    return max(next_id, track.id + 1)
 
 
 def _seen(track: Track) -> float:
