@@ -16,8 +16,8 @@ from visfuse_cli.tracking.settings import FilterSettings, TargetSettings
 WHEELBASE_SHARE = 0.6  # of a vehicle's length
 COURSES = (course.CSD, course.CS, course.CD)  # Bradshaw 1997, sec. 4.1
 QUIET = 0.2  # of the usual noise: what a motion that holds its speed still has
-BELIEVED_SIGMA = 4.0  # a speed further from the expected one is something else's
 STRAIGHT = 0.02  # rad/s per root Hz: what one that holds its course still has
+BELIEVED_SIGMA = 4.0  # a speed further from the expected one is something else's
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 from functools import partial
 
 import numpy as np
+from numpy.typing import NDArray
 
 from visfuse_cli.maths.assignment import gate_size
 from visfuse_cli.maths.cameras import project
@@ -145,10 +146,7 @@ class GroundTracker:
         border = np.where(np.isnan(look.likeness), look.border, look.likeness) * fit.agreed
         there = fit.ok & measure.looks_right(fit, look.outlines) & (look.moved > SEEN_SHARE) & ~(border < SEEN_SHARE)
         there &= look.open > LEAST_OPEN
-        along = np.column_stack([np.cos(pose[:, 2]), np.sin(pose[:, 2])])
-        velocity = np.array([self.dynamics.planar(expected.prior.mean)[0][2:] for expected in self._expected])
-        moves = self._nursery.moves()
-        pace, doubt = texture.paces(self.camera, pose, size, np.sum(velocity * along, axis=1), moves)
+        along, pace, doubt = self._paces(pose, size, look.open < HIDDEN)
         for k, track in enumerate(self.tracks):
             step = dynamics_tools.coast(self._expected[k])
             if np.isfinite(border[k]):
@@ -167,10 +165,21 @@ class GroundTracker:
                 else:
                     track.refused += 1
                     track.refused_since = sample.t if track.refused_since is None else track.refused_since
-            if look.open[k] < HIDDEN and np.isfinite(pace[k]):
+            if np.isfinite(pace[k]):
                 step = dynamics_tools.take_speed(self.dynamics, step, along[k], pace[k], doubt[k])
             track.samples.append(sample)
             track.steps.append(step)
+
+    def _paces(self, pose: Array, size: Array, hidden: NDArray[np.bool_]) -> tuple[Array, Array, Array]:
+        """Headings (N, 2), and speeds (N,) m/s along them with their deviations (N,), as the corners on the boxes that
+        are partly `hidden` (N,) tell; NaN of the others."""
+        along = np.column_stack([np.cos(pose[:, 2]), np.sin(pose[:, 2])])
+        if not hidden.any():
+            return along, np.full(len(pose), np.nan), np.full(len(pose), np.nan)
+        velocity = np.array([self.dynamics.planar(each.prior.mean)[0][2:] for each in self._expected])
+        expected = np.sum(velocity * along, axis=1)
+        pace, doubt = texture.paces(self.camera, pose, size, expected, self._nursery.moves())
+        return along, np.where(hidden, pace, np.nan), doubt
 
     def _reconsider(self, evidence: Evidence) -> None:
         """Look at the track with the most doubt about it as if it were new, and put the better guess in its place."""
