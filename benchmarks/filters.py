@@ -122,9 +122,11 @@ def _interacting(tracks: int, F: np.ndarray, Q: np.ndarray) -> Step:
     H = np.eye(3, size)
 
     def step() -> None:
+        nonlocal bank
         ahead = imm.predict(bank, log_p, lambda x: (gaussian.times(F, x), F, Q))
         after, _ = imm.update(ahead, 0.1 - ahead.predicted.mean[..., :3], H, R3)
-        imm.combined(after.filtered)
+        bank = after.filtered
+        imm.combined(bank)
 
     return step
 

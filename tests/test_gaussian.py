@@ -39,6 +39,17 @@ def test_a_measurement_of_all_but_unknown_states_leaves_its_own_noise():
         assert np.linalg.eigvalsh(after.cov).min() > 0
 
 
+def test_a_direction_all_but_unknown_leaves_the_others_as_they_are():
+    rng = np.random.default_rng(10)
+    R = 0.04 * np.eye(2)
+    for _ in range(20):
+        axes, _ = np.linalg.qr(rng.normal(size=(4, 4)))  # the vague one lies across all that is measured
+        variances = np.array([1e12, 1, 1, 1])
+        after, _ = gaussian.update(Gaussian(np.zeros(4), axes * variances @ axes.T), rng.normal(size=2), H, R)
+        information = axes / variances @ axes.T + H.T @ np.linalg.inv(R) @ H
+        np.testing.assert_allclose(after.cov @ information, np.eye(4), atol=0.02)
+
+
 def test_filter_over_many_steps_equals_one_joint_gaussian():
     rng = np.random.default_rng(2)
     steps, q = 6, 0.7

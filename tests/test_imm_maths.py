@@ -118,6 +118,18 @@ def test_mixing_keeps_the_moments_of_all_models_together(seed):
     assert np.linalg.eigvalsh(mixed.cov).min() > 0
 
 
+def test_models_either_side_of_the_half_turn_meet_there():
+    bank = imm.Bank(Gaussian(np.array([[0.0, 3.0], [2.0, -3.0]]), np.zeros((2, 2, 2))), np.log([0.5, 0.5]))
+    apart = np.pi - 3
+    for angles, mean, deviation in (((1,), np.pi, apart), ((), 0.0, -3.0), ((1,), np.pi, apart)):
+        both = imm.combined(bank, angles)
+        np.testing.assert_allclose(np.abs(both.mean), [1.0, mean], atol=1e-12)
+        np.testing.assert_allclose(both.cov, [[1.0, deviation], [deviation, deviation**2]], atol=1e-12)
+        mixed, _ = imm.mix(bank, np.log(np.full((2, 2), 0.5)), angles)
+        np.testing.assert_allclose(np.abs(mixed.mean), np.abs([both.mean] * 2), atol=1e-12)
+        np.testing.assert_allclose(mixed.cov, [both.cov] * 2, atol=1e-12)
+
+
 @settings(max_examples=25, deadline=None)
 @given(st.integers(0, 1000), st.permutations([0, 1, 2]), st.floats(0.01, 100))
 def test_an_instant_does_not_depend_on_the_models_order_nor_on_units(seed, order, unit):

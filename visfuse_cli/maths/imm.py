@@ -9,7 +9,8 @@ is batched over leading axes.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 
@@ -19,20 +20,44 @@ from visfuse_cli.maths.gaussian import symmetrise, times, transpose
 from visfuse_cli.records import Array, Gaussian, Innovation
 
 LEAST_LEFT, LEAST_KNOWN = 1e-12, 1e-9  # shares of a variance: rounding, below
-LEAST_LIKELY = float(np.finfo(float).tiny)  # a probability that can still be divided by
+LEAST_LIKELY = np.array(np.finfo(float).tiny)  # a probability that can still be divided by
 Advance = Callable[[Array], tuple[Array, Array, Array]]  # x (..., r, N) -> x', F, Q, each model by its own motion
 
 
-@dataclass(frozen=True, slots=True)
+class Moments(NamedTuple):
+    """How r models of probabilities mu (..., r) lie about the mean (..., 1, N) of them all.
+
+    off (..., r, N) is what each one's mean differs by, second (..., r, N N) its second moments about the common one.
+    """
+
+    angles: tuple[int, ...]
+    mu: Array
+    mean: Array
+    off: Array
+    second: Array
+
+    def together(self) -> Gaussian:
+        """One belief (..., N) with the mean and covariance of all."""
+        mean = self.mean[..., 0, :]
+        return Gaussian(mean, _shared(self.mu[..., None, :], self.second).reshape(*mean.shape, -1))
+
+
+@dataclass(slots=True)
 class Bank:
-    """What each of r models believes (..., r, N), and the models' log probabilities (..., r)."""
+    """What each of r models believes (..., r, N), and the models' log probabilities (..., r); both for good."""
 
     beliefs: Gaussian
     log_mu: Array
+    _moments: Moments | None = field(default=None, init=False, repr=False, compare=False)
+
+    def moments(self, angles: tuple[int, ...]) -> Moments:
+        """How the models lie about their mean: made once, for `combined` and for the next `mix`."""
+        if self._moments is None or self._moments.angles != angles:
+            self._moments = _moments(self.beliefs, np.exp(self.log_mu), angles)
+        return self._moments
 
 
-@dataclass(frozen=True, slots=True)
-class Step:
+class Step(NamedTuple):
     """One instant: beliefs mixed and predicted (..., r, N), the way between them, log probabilities ahead, and after.
 
     `filtered` is the prediction itself where nothing was measured.
@@ -100,25 +125,33 @@ def mix(bank: Bank, log_p: Array, angles: tuple[int, ...] = ()) -> tuple[Gaussia
 
     `angles` are components of the state on the circle. Bradshaw 1997, sec. 5.
     """
-    p, mu = np.exp(log_p), np.exp(bank.log_mu)
-    c = np.maximum(np.dot(mu, p), LEAST_LIKELY)  # c_j = sum_i p_ij mu_i: Jia 2008, eq. 23
-    share = p.T * mu[..., None, :]
+    known, p = bank.moments(angles), np.exp(log_p)
+    c = np.maximum(known.mu.dot(p), LEAST_LIKELY)  # c_j = sum_i p_ij mu_i: Jia 2008, eq. 23
+    share = p.T * known.mu[..., None, :]
     share /= c[..., None]  # mu_i|j, j first: Jia 2008, eq. 24
-    return _matched(bank.beliefs, share, angles), np.log(c)
+    shift = _shared(share, known.off)
+    cov = _shared(share, known.second).reshape(*shift.shape, -1)
+    cov -= shift[..., :, None] * shift[..., None, :]  # from about the common mean to about each one's own
+    return Gaussian(wrap_at(known.mean + shift, angles), cov), np.log(c)
 
 
-def _matched(beliefs: Gaussian, share: Array, angles: tuple[int, ...]) -> Gaussian:
-    """Gaussians (..., j, N) with the first two moments of mixtures of r beliefs, in shares (..., j, r)."""
-    origin = beliefs.mean[..., :1, :]
-    off = wrap_at(beliefs.mean - origin, angles)
-    # Second moments about one origin near them all: the outer product of Jia 2008, eq. 26, in one matrix product.
-    second = off[..., :, None] * off[..., None, :]
+def _moments(beliefs: Gaussian, mu: Array, angles: tuple[int, ...]) -> Moments:
+    """How r beliefs (..., r, N) of probabilities mu (..., r) lie about their mean."""
+    means, share = beliefs.mean, mu[..., None, :]
+    if angles:
+        near = means[..., :1, :]
+        mean = wrap_at(near + _shared(share, wrap_at(means - near, angles)), angles)
+    else:
+        mean = _shared(share, means)
+    off = wrap_at(means - mean, angles)
+    second = off[..., :, None] * off[..., None, :]  # the outer product of Jia 2008, eq. 26
     second += beliefs.cov
-    r, N = off.shape[-2:]
-    shift = share @ off
-    cov = (share @ second.reshape(*off.shape[:-2], r, N * N)).reshape(*shift.shape, N)
-    cov -= shift[..., :, None] * shift[..., None, :]
-    return Gaussian(wrap_at(origin + shift, angles), cov)
+    return Moments(angles, mu, mean, off, second.reshape(*off.shape[:-1], -1))
+
+
+def _shared(share: Array, rows: Array) -> Array:
+    """Sums (..., j, n) of rows (..., r, n) in shares (..., j, r)."""
+    return share.dot(rows) if share.ndim == 2 else share @ rows  # the same for one track, in half the time
 
 
 def predict(bank: Bank, log_p: Array, advance: Advance, angles: tuple[int, ...] = ()) -> Step:
@@ -145,21 +178,13 @@ def update(step: Step, residual: Array, H: Array, R: Array) -> tuple[Step, Innov
 def weigh(ahead: Array, log_likelihood: Array) -> Array:
     """The models' log probabilities (..., r) after a measurement. Jia 2008, eqs. 28-29, the sum over j."""
     log_mu = ahead + log_likelihood
-    log_mu -= _log_sum(log_mu, axis=-1)[..., None]
+    log_mu -= np.logaddexp.reduce(log_mu, axis=-1, keepdims=True)
     return log_mu
 
 
 def combined(bank: Bank, angles: tuple[int, ...] = ()) -> Gaussian:
     """One belief (..., N) for all models. Jia 2008, eqs. 30-31."""
-    mu, beliefs = np.exp(bank.log_mu)[..., None, :], bank.beliefs
-    origin = beliefs.mean[..., :1, :]
-    off = wrap_at(beliefs.mean - origin, angles)
-    shift = mu @ off
-    spread = (off - shift) * np.sqrt(transpose(mu))
-    r, N = off.shape[-2:]
-    cov = (mu @ beliefs.cov.reshape(*off.shape[:-2], r, N * N)).reshape(*off.shape[:-2], N, N)
-    cov += transpose(spread) @ spread  # symmetric to the last bit, as the beliefs are
-    return Gaussian(wrap_at(origin + shift, angles)[..., 0, :], cov)
+    return bank.moments(angles).together()
 
 
 def smooth(steps: Sequence[Step], log_p: Array, angles: tuple[int, ...] = ()) -> list[Bank]:
@@ -202,9 +227,8 @@ def _smoothed(now: Bank, after: Step, log_p: Array, later: Bank, angles: tuple[i
     share = share - _log_sum(share, axis=-2)[..., None, :]  # of j, given i next and all that was seen
     joint = share + later.log_mu[..., None, :]
     log_mu = _log_sum(joint, axis=-1)
-    one = _matched(moved, np.exp(joint - log_mu[..., None])[..., None, :], ())
-    mean, cov = one.mean[..., 0, :], one.cov[..., 0, :, :]
-    return Bank(Gaussian(wrap_at(now.beliefs.mean + mean, angles), symmetrise(cov)), log_mu)
+    one = _moments(moved, np.exp(joint - log_mu[..., None]), ()).together()
+    return Bank(Gaussian(wrap_at(now.beliefs.mean + one.mean, angles), symmetrise(one.cov)), log_mu)
 
 
 def _of_the_future(after: Step, later: Bank, angles: tuple[int, ...]) -> tuple[Array, Array]:

@@ -263,7 +263,7 @@ def take_speed(dynamics: Dynamics, step: Step, along: Array, speed: float, sigma
     if step.models is None:
         return replace(step, posterior=posterior)
     log_mu = imm.weigh(step.models.filtered.log_mu, innovation.log_likelihood)
-    models = replace(step.models, filtered=imm.Bank(posterior, log_mu))
+    models = step.models._replace(filtered=imm.Bank(posterior, log_mu))
     return replace(step, posterior=imm.combined(models.filtered, dynamics.angles_x), models=models)
 
 
