@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.stats import binom
+from scipy.special import bdtr
 
 from visfuse_cli.records import Array
 
@@ -15,10 +15,10 @@ def percentile(values: Array, share: float, confidence: float = 0.95) -> tuple[f
     """
     ordered = np.sort(np.asarray(values, dtype=float))
     tail, count = (1 - confidence) / 2, len(ordered)
-    low = int(binom.ppf(tail, count, share))  # the largest rank that lies below the percentile surely enough
-    while low > 0 and binom.cdf(low - 1, count, share) > tail:
-        low -= 1
-    high = int(binom.ppf(1 - tail, count, share)) + 1
+    # how sure it is that no more than so many values lie below it
+    sure = bdtr(np.arange(count + 1), count, share)
+    low, high = (int(np.searchsorted(sure, which)) for which in (tail, 1 - tail))
+    high += 1
     return (
         float(np.quantile(ordered, share)),
         float(ordered[low - 1]) if low > 0 else None,
