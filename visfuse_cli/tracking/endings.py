@@ -62,8 +62,8 @@ def trimmed(track: Track, reason: str) -> Track:
 
 
 def _out_of_picture(camera: GroundCamera, pose: Array, size: Array) -> np.ndarray:
-    pixels, _ = project(camera, wireframe.corners(pose, size))
-    low, high = pixels.min(axis=1), pixels.max(axis=1)
+    pixels = wireframe.projected(camera, pose, size)
+    low, high = pixels.min(axis=2).T, pixels.max(axis=2).T
     inside = np.clip(np.minimum(high, camera.image_size) - np.maximum(low, 0), 0, None)
     return np.asarray(~(np.prod(inside, axis=1) > LEAST_OPEN * np.prod(high - low, axis=1)))
 

@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from visfuse_cli.maths.assignment import assign
-from visfuse_cli.maths.cameras import project
 from visfuse_cli.records import Array, GroundCamera, Image, Region
 from visfuse_cli.tracking.association import overlap, region_boxes
 from visfuse_cli.tracking.elsewhere import HandOver, at_once
@@ -119,13 +118,12 @@ class LabelEvidence:
         """Mask (H, W), 255 in and close to the silhouettes of N boxes."""
         width, height = self._camera.image_size
         explained = np.zeros((height, width), np.uint8)
-        pixels, _ = project(self._camera, wireframe.corners(pose, size))
-        for corner in pixels:
-            if np.isfinite(corner).all():
-                hull = contour.hull_of(self._camera, corner)
-                margin = max(2, round(MARGIN * float(np.ptp(corner, axis=0).max())))
+        pixels = wireframe.projected(self._camera, pose, size)
+        extent = np.ptp(pixels, axis=2).max(axis=0)
+        for hull, across in zip(contour.hulls_of(self._camera, pixels), extent, strict=True):
+            if len(hull):
                 cv2.fillConvexPoly(explained, hull, 255)
-                cv2.polylines(explained, [hull], True, 255, 2 * margin + 1)
+                cv2.polylines(explained, [hull], True, 255, 2 * max(2, round(MARGIN * float(across))) + 1)
         return explained
 
 
@@ -172,9 +170,8 @@ class BoxEvidence:
 
     def _overlaps(self, pose: Array, size: Array) -> Array:
         """Intersection over union (R, N) of each detection with each expected box."""
-        pixels, _ = project(self._camera, wireframe.corners(pose, size))
-        pixels = np.nan_to_num(pixels, nan=-1e4)
-        expected = np.concatenate([pixels.min(axis=1), pixels.max(axis=1)], axis=1)
+        pixels = np.nan_to_num(wireframe.projected(self._camera, pose, size), nan=-1e4)
+        expected = np.concatenate([pixels.min(axis=2), pixels.max(axis=2)]).T
         return overlap(region_boxes(self._regions), expected)[0]
 
     def _sides(self, number: int) -> Outlines:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any, Literal, Protocol
 
 import cv2
@@ -17,9 +17,9 @@ from visfuse_cli.tracking.evidence import Boxes, BoxEvidence, Evidence, LabelEvi
 from visfuse_cli.tracking.ground import GroundTracker
 from visfuse_cli.tracking.sun import Shade, Sun, shadow_picture
 from visfuse_cli.tracking.zones import Region
+from visfuse_cli.vision import contour, wireframe
 from visfuse_cli.vision import regions as region_tools
 from visfuse_cli.vision.background import Background
-from visfuse_cli.vision.lens import distort_points
 from visfuse_cli.vision.steady import moved
 
 SETTLED = 12  # frames after which a track's size is known well enough to tell its shadow
@@ -109,13 +109,15 @@ class MovingRegions:
         pose, size = tracker.boxes()
         settled = np.array([len(t.samples) >= SETTLED and t.samples[-1].measured for t in tracker.tracks], dtype=bool)
         self._sun.look(frame.t, self._labels, pose, size, settled, [track.id for track in tracker.tracks])
-        followed = tracker.outlines()
-        lens = self._camera.ground.lens
-        if lens is not None:
-            followed = [distort_points(outline, lens) for outline in followed if len(outline)]
-        raw = self._raw
+        followed, raw = self._outlines(pose, size), self._raw
         self._learnt()
         self._learnt = self._hand_over(lambda: self._background.learn(frame.image, frame.t, followed, raw))
+
+    def _outlines(self, pose: Array, size: Array) -> Iterator[Array]:
+        """Outlines (k, 2) px of N boxes as the footage shows them, found when they are asked for: few frames are."""
+        for hull in contour.hulls_of(self._camera, wireframe.projected(self._camera, pose, size)):
+            if len(hull):
+                yield hull
 
     def report(self) -> dict[str, Any] | None:
         self._learnt()

@@ -129,15 +129,15 @@ def shadow_picture(camera: GroundCamera, pose: Array, size: Array, per_metre: Ar
     width, height = camera.image_size
     mask = np.zeros((height, width), np.uint8)
     half = np.array([[1, 1], [1, -1], [-1, -1], [-1, 1]]) / 2
-    for (x, y, theta), box in zip(pose, size, strict=True):
-        c, s = np.cos(theta), np.sin(theta)
-        foot = (half * box[:2]) @ np.array([[c, s], [-s, c]]) + [x, y]
-        ground = np.concatenate([foot, foot + box[2] * per_metre])
-        pixels, _ = project(camera, np.column_stack([ground, np.zeros(8)]))
-        if np.isfinite(pixels).all():
-            cv2.fillConvexPoly(mask, contour.hull_of(camera, pixels), 255)
-    mask[contour.owners(camera, pose, size) > 0] = 0
-    return mask
+    c, s = np.cos(pose[:, 2]), np.sin(pose[:, 2])
+    turn = np.stack([np.stack([c, s], axis=-1), np.stack([-s, c], axis=-1)], axis=-2)
+    foot = (half * size[:, None, :2]) @ turn + pose[:, None, :2]
+    ground = np.concatenate([foot, foot + size[:, 2, None, None] * per_metre], axis=1)  # (N, 8, 2)
+    pixels, _ = project(camera, np.concatenate([ground, np.zeros((*ground.shape[:2], 1))], axis=-1))
+    for hull in contour.hulls_of(camera, np.moveaxis(pixels, -1, 0)):
+        if len(hull):
+            cv2.fillConvexPoly(mask, hull, 255)
+    return np.asarray(cv2.subtract(mask, cv2.compare(contour.owners(camera, pose, size), 0, cv2.CMP_GT)), np.uint8)
 
 
 class Shade:
@@ -154,9 +154,10 @@ class Shade:
 
     def cut(self, labels: Image, image: Image, empty: Image, where: Image) -> Image:
         """Labels with the foreground that is as dark as shadows are made shadow `where` one falls."""
-        v, u = np.nonzero(cv2.bitwise_and(where, labels))
-        if not len(v):
+        places = cv2.findNonZero(cv2.bitwise_and(where, labels))
+        if places is None:
             return labels
+        u, v = places[:, 0].T
         seen, lit = image[v, u].astype(np.float32), empty[v, u].astype(np.float32)
         share = seen.sum(axis=1) / np.maximum(lit.sum(axis=1), 1.0)
         grey = np.abs(seen - share[:, None] * lit).max(axis=1) < COLOUR

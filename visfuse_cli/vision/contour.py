@@ -14,12 +14,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from visfuse_cli.maths.cameras import project
 from visfuse_cli.records import Array, GroundCamera, Image
 from visfuse_cli.vision.background import FOREGROUND
 from visfuse_cli.vision.labels import Labels
 from visfuse_cli.vision.lens import distort_points
-from visfuse_cli.vision.wireframe import DIRECTIONS, EDGES, Outlines, corners, silhouette_edges
+from visfuse_cli.vision.wireframe import DIRECTIONS, EDGES, Outlines, projected, silhouette_edges
 
 STEPS = 12  # places either side of the expected edge
 SURE = 4  # places either side of the found one that must agree
@@ -37,19 +36,22 @@ def owners(camera: GroundCamera, pose: Array, size: Array) -> Image:
     """Whose silhouette each pixel (H, W) belongs to: 1 + the row of the nearest box there, 0 of none, 255 at most."""
     width, height = camera.image_size
     mask = np.zeros((height, width), np.uint8)
-    distance = np.linalg.norm(pose[:, :2] - camera.centre[:2], axis=1)
-    pixels, _ = project(camera, corners(pose, size))
+    distance = np.hypot(*(pose[:, :2] - camera.centre[:2]).T)
+    hulls = hulls_of(camera, projected(camera, pose, size))
     for k in np.argsort(-distance):
-        if np.isfinite(pixels[k]).all():
-            cv2.fillConvexPoly(mask, hull_of(camera, pixels[k]), int(min(k + 1, 255)))
+        if len(hulls[k]):
+            cv2.fillConvexPoly(mask, hulls[k], int(min(k + 1, 255)))
     return mask
 
 
-def hull_of(camera: GroundCamera, pixels: Array) -> np.ndarray:
-    """The hull (k, 2) of points (n, 2) px as the footage shows them, rounded."""
-    lens = camera.ground.lens
-    seen = pixels if lens is None else distort_points(pixels, lens)
-    return np.asarray(cv2.convexHull(np.round(np.clip(seen, -1e4, 1e4)).astype(np.int32)))
+def hulls_of(camera: GroundCamera, pixels: Array) -> list[np.ndarray]:
+    """The hulls (k, 2) of N times n points (2, N, n) px as the footage shows them, rounded; empty where any is NaN."""
+    points = pixels.transpose(1, 2, 0)
+    known = np.asarray(np.isfinite(points).all(axis=(1, 2)))
+    if camera.ground.lens is not None:
+        points = distort_points(points.reshape(-1, 2), camera.ground.lens).reshape(points.shape)
+    whole = np.round(np.minimum(np.maximum(points, -1e4), 1e4)).astype(np.int32)
+    return [cv2.convexHull(each) if sure else each[:0] for each, sure in zip(whole, known, strict=True)]
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,12 +125,13 @@ def profiles(
     known = inside & ((whose == 0) | (whose == code[:, None, None]))
     paint = known & (label == FOREGROUND)
     found = _border(known, np.stack([paint, known & (label > 0)]), offset)  # shadow is outside, or it is grey paint
-    nearest = np.where(np.abs(found[1]) < np.abs(np.nan_to_num(found[0], nan=np.inf)), found[1], found[0])
+    nearer = np.abs(found[1]) < np.where(np.isnan(found[0]), np.inf, np.abs(found[0]))
+    nearest = np.where(nearer, found[1], found[0])
     ground = edge < GROUND_EDGES
     under = _stands_in_shadow(paint, known, offset, found, ground)
     nearest = np.where(under, found[0], nearest)
     valid = np.isfinite(nearest)
-    support = _dot(normal, at) + np.nan_to_num(nearest)
+    support = _dot(normal, at) + np.where(valid, nearest, 0.0)
     rows = np.ascontiguousarray(np.moveaxis(normal, 0, -1))
     outlines = Outlines(rows, support, EDGES[edge], share, valid, np.zeros(len(pose), dtype=bool), total / np.pi)
     clear = valid & (under | (np.abs(found[1] - nearest) < CLEAR_PX))
@@ -202,8 +205,8 @@ def _places(
     at (2, N, K) px and outward normal (2, N, K) of the places, which of the EDGES (N, K) each lies on and how far along
     it (N, K), and the border's length (N,) px. Coordinates come first: numpy is slow along short last axes.
     """
-    pixels, _ = project(camera, corners(pose, size))
-    pixels = np.nan_to_num(np.moveaxis(pixels, -1, 0), nan=-1e4)  # (2, N, 8)
+    pixels = projected(camera, pose, size)
+    pixels = np.where(np.isnan(pixels), -1e4, pixels)
     first, last = pixels[..., EDGES[:, 0]], pixels[..., EDGES[:, 1]]  # (2, N, 12)
     length = _length(last - first) * silhouette_edges(camera, pose, size)
     total = np.cumsum(length, axis=1)
@@ -211,7 +214,7 @@ def _places(
     edge = np.minimum(np.count_nonzero(places[:, :, None] > total[:, None], axis=2), len(EDGES) - 1)  # (N, K)
     rows = np.arange(len(pose))[:, None]
     share = (places - total[rows, edge]) / np.maximum(length[rows, edge], 1e-9) + 1
-    share = np.clip(share, 0, 1)
+    share = np.minimum(np.maximum(share, 0), 1)
     a, b = first[:, rows, edge], last[:, rows, edge]
     at = a + share * (b - a)
     normal = np.stack([b[1] - a[1], a[0] - b[0]])
@@ -249,7 +252,9 @@ def _stands_in_shadow(
     A grey vehicle looks like shadow too, but then its paint is no more than its windows, lamps and wheels.
     """
     both = ground & (found[1] - found[0] > CLEAR_PX)
-    inside = both[..., None] & (offset[:, None] < np.nan_to_num(found[0])[..., None])
+    if not both.any():
+        return both
+    inside = both[..., None] & (offset[:, None] < np.where(both, found[0], 0.0)[..., None])
     solid = np.count_nonzero(inside & paint, axis=(1, 2)) > SOLID * np.count_nonzero(inside & known, axis=(1, 2))
     return np.asarray(both & solid[:, None])
 
@@ -269,12 +274,13 @@ def _look(sights: Sequence[Sight], camera: GroundCamera, points: Array) -> tuple
     if camera.ground.lens is not None:
         points = distort_points(points.reshape(2, -1).T, camera.ground.lens).T.reshape(points.shape)
     height, width = sights[0].owner.shape
-    u, v = np.rint(np.clip(points, -2, 1e5)).astype(np.intp)
+    u, v = np.rint(np.minimum(np.maximum(points, -2), 1e5)).astype(np.intp)
     inside = (u > 0) & (u < width - 1) & (v > 0) & (v < height - 1)
+    place = v * width + u
     if len(sights) == 1:
-        return sights[0].labels.at(v, u), sights[0].owner.take(v * width + u, mode="clip"), inside
-    label = np.stack([sight.labels.at(v[k], u[k]) for k, sight in enumerate(sights)])
-    whose = np.stack([sight.owner.take(v[k] * width + u[k], mode="clip") for k, sight in enumerate(sights)])
+        return sights[0].labels.at(place), sights[0].owner.take(place, mode="clip"), inside
+    label = np.stack([sight.labels.at(place[k]) for k, sight in enumerate(sights)])
+    whose = np.stack([sight.owner.take(place[k], mode="clip") for k, sight in enumerate(sights)])
     return label, whose, inside
 
 

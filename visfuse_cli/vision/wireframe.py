@@ -13,7 +13,6 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from visfuse_cli.maths.cameras import project
 from visfuse_cli.records import Array, GroundCamera
 
 DIRECTIONS = 24
@@ -21,6 +20,13 @@ FAN = np.column_stack([np.cos(a := np.arange(DIRECTIONS) * 2 * np.pi / DIRECTION
 AXES = np.arange(DIRECTIONS) % (DIRECTIONS // 4) == 0  # the four sides of an upright box
 _SIGNS = np.array([[i, j, k] for k in (0, 1) for i in (-1, 1) for j in (-1, 1)], dtype=float)
 _HALF = _SIGNS * [0.5, 0.5, 1.0]  # corners of a box of unit size
+# The world coordinates (4, 8 terms, 8 corners), homogeneous, that each term of a box adds to its corners (see _terms).
+_IN_TERMS = np.zeros((4, 8, 8))
+_IN_TERMS[0, 0] = _IN_TERMS[1, 1] = _IN_TERMS[3, 7] = 1
+_IN_TERMS[0, 2] = _IN_TERMS[1, 3] = _HALF[:, 0]
+_IN_TERMS[0, 5], _IN_TERMS[1, 4], _IN_TERMS[2, 6] = -_HALF[:, 1], _HALF[:, 1], _HALF[:, 2]
+_SLOPES = np.zeros((7, 8))  # d terms / d (x, y, theta, l, w, h) as far as they are the same for every box
+_SLOPES[0, 0] = _SLOPES[1, 1] = _SLOPES[5, 6] = 1
 EDGES = np.array(
     [(0, 1), (1, 3), (3, 2), (2, 0), (4, 5), (5, 7), (7, 6), (6, 4), (0, 4), (1, 5), (2, 6), (3, 7)],
     np.int8,  # every frame of every track keeps some
@@ -28,6 +34,7 @@ EDGES = np.array(
 # The faces that meet in each edge: rear, front, right, left, bottom, top.
 _MEET = np.array([(0, 4), (3, 4), (1, 4), (2, 4), (0, 5), (3, 5), (1, 5), (2, 5), (0, 2), (0, 3), (1, 2), (1, 3)])
 
+BEFORE = 1e-9  # depth of what lies before the camera
 SETTLED = 1e-3  # m and rad: a smaller step changes nothing
 
 
@@ -92,19 +99,57 @@ def corners(pose: Array, size: Array) -> Array:
     return placed
 
 
-def _corner_jacobian(pose: Array, size: Array) -> Array:
-    """d corner / d (x, y, theta, l, w, h): (N, 8, 3, 6)."""
-    half = _HALF
-    local = half * size[:, None, :]
-    c, s = np.cos(pose[:, 2, None]), np.sin(pose[:, 2, None])
-    J = np.zeros((len(pose), 8, 3, 6))
-    J[..., 0, 0] = J[..., 1, 1] = 1
-    J[..., 0, 2] = -s * local[..., 0] - c * local[..., 1]
-    J[..., 1, 2] = c * local[..., 0] - s * local[..., 1]
-    J[..., 0, 3], J[..., 1, 3] = c * half[:, 0], s * half[:, 0]
-    J[..., 0, 4], J[..., 1, 4] = -s * half[:, 1], c * half[:, 1]
-    J[..., 2, 5] = half[:, 2]
-    return J
+def projected(camera: GroundCamera, pose: Array, size: Array) -> Array:
+    """The corners of N boxes as the camera sees them, (2, N, 8) px; NaN at or behind the camera."""
+    terms = np.empty((len(pose), 8))
+    _terms(pose, size, np.cos(pose[:, 2]), np.sin(pose[:, 2]), terms)
+    image = (terms @ _seen_terms(camera)).reshape(-1, 3, 8).swapaxes(0, 1)
+    return np.asarray(image[:2] / np.where(image[2] > BEFORE, image[2], np.nan))
+
+
+def _terms(pose: Array, size: Array, c: Array, s: Array, out: Array) -> None:
+    """What the corners of N boxes are linear in, (N, 8): x, y, l c, l s, w c, w s, h and 1, of heading cosines c (N,)
+    and sines s (N,)."""
+    out[:, :2], out[:, 6], out[:, 7] = pose[:, :2], size[:, 2], 1
+    out[:, 2], out[:, 3] = size[:, 0] * c, size[:, 0] * s
+    out[:, 4], out[:, 5] = size[:, 1] * c, size[:, 1] * s
+
+
+def _seen_terms(camera: GroundCamera) -> Array:
+    """From the terms of a box to its corners in the image, homogeneous: (8, 24), u, v and depth of eight each."""
+    return np.asarray(
+        (camera.image_from_world @ _IN_TERMS.reshape(4, 64)).reshape(3, 8, 8).swapaxes(0, 1).reshape(8, 24)
+    )
+
+
+def _linearised(seen: Array, x: Array, slopes: Array) -> Array:
+    """The corners of N boxes x (N, 6) and their derivatives: (N, 7, 16) px, eight u and then eight v of each.
+
+    `seen` are the camera's `_seen_terms`; the rows are d / d (x, y, theta, l, w, h) and the corners themselves. Of
+    `slopes` (N, 7, 8), the derivatives of the terms, those that do not change are there already.
+    """
+    c, s = np.cos(x[:, 2]), np.sin(x[:, 2])
+    _terms(x[:, :3], x[:, 3:], c, s, slopes[:, 6])
+    terms = slopes[:, 6]
+    slopes[:, 2, 2], slopes[:, 2, 3], slopes[:, 2, 4], slopes[:, 2, 5] = (
+        -terms[:, 3],
+        terms[:, 2],
+        -terms[:, 5],
+        terms[:, 4],
+    )
+    slopes[:, 3, 2] = slopes[:, 4, 4] = c
+    slopes[:, 3, 3] = slopes[:, 4, 5] = s
+    image = (slopes.reshape(-1, 8) @ seen).reshape(len(x), 7, 3, 8)
+    depth = image[:, 6:, 2:].copy()
+    behind = ~(depth > BEFORE)
+    if behind.any():
+        depth[behind] = np.nan
+    image /= depth
+    pixels = image[:, 6:, :2]
+    image[:, :6, :2] -= pixels * image[:, :6, 2:]
+    if behind.any():
+        image[:, :6], image[:, 6] = np.nan_to_num(image[:, :6]), np.nan_to_num(image[:, 6], nan=-1e9)
+    return image[:, :, :2].reshape(len(x), 7, 16)
 
 
 def silhouette_edges(camera: GroundCamera, pose: Array, size: Array) -> np.ndarray:
@@ -162,55 +207,56 @@ def fit(
     prior = np.concatenate([pose, size], axis=1)
     weight = 1 / np.concatenate([pose_sigma, size_sigma], axis=1) ** 2
     x = prior.copy()
-    valid, normal = outlines.valid, outlines.normal
-    noise = np.asarray(sigma_px, dtype=float)[:, None]
-    shares = _corner_shares(outlines)
+    valid, noise = outlines.valid, np.asarray(sigma_px, dtype=float)[:, None]
+    rows, seen, slopes = _rows(outlines), _seen_terms(camera), np.tile(_SLOPES, (len(x), 1, 1))
+    trust, far = valid / noise**2, 1 / (3 * noise) ** 2
     N, residual = np.zeros(0), np.zeros(0)
     for _ in range(iterations):
-        pixels, J_pixel = project(camera, corners(x[:, :3], x[:, 3:]))
-        if not np.isfinite(pixels).all():
-            pixels, J_pixel = np.nan_to_num(pixels, nan=-1e9), np.nan_to_num(J_pixel)
+        image = _linearised(seen, x, slopes)
         if outlines.tangent.any():
-            outermost = np.argmax(pixels @ normal.swapaxes(1, 2), axis=1)
-            shares[outlines.tangent] = np.eye(8)[outermost[outlines.tangent]]
-        at = shares @ pixels
-        residual = outlines.support - (at[..., 0] * normal[..., 0] + at[..., 1] * normal[..., 1])
-        J_corner = J_pixel @ _corner_jacobian(x[:, :3], x[:, 3:])  # (N, 8, 2, 6)
-        J_at = (shares @ J_corner.reshape(len(x), 8, 12)).reshape(*residual.shape, 2, 6)
-        J = normal[..., :1] * J_at[..., 0, :] + normal[..., 1:] * J_at[..., 1, :]
+            rows[outlines.tangent] = _outermost(outlines[outlines.tangent], image[outlines.tangent, 6])
+        J = rows @ image.swapaxes(1, 2)  # (N, K, 7): the last column is where each row is expected
+        residual = J[..., 6] = outlines.support - J[..., 6]
         # A Cauchy weight: a mirror, a patch of shadow or a missing corner moves one row, not the box.
-        robust = valid / (1 + (residual / (3 * noise)) ** 2) / noise**2
-        weighted = (robust[..., None] * J).swapaxes(1, 2)
-        N = weighted @ J
+        robust = trust / (1 + residual * residual * far)
+        normal_equations = (robust[..., None] * J[..., :6]).swapaxes(1, 2) @ J
+        N = normal_equations[..., :6]
         diagonal = np.einsum("nii->ni", N)
         diagonal += weight
         diagonal += 1e-9 * diagonal.sum(axis=1, keepdims=True)
-        gradient = (weighted @ residual[..., None])[..., 0] + weight * (prior - x)
+        gradient = normal_equations[..., 6] + weight * (prior - x)
         step = np.linalg.solve(N, gradient[..., None])[..., 0]
-        limit = np.minimum(1, 2.0 / np.maximum(np.linalg.norm(step[:, :2], axis=1), 1e-9))
+        limit = np.minimum(1, 2.0 / np.maximum(np.sqrt(step[:, 0] ** 2 + step[:, 1] ** 2), 1e-9))
         x = x + step * limit[:, None]
         x[:, 3:] = np.maximum(x[:, 3:], 0.2)
         if np.abs(step).max() < SETTLED:
             break
-    seen = valid.sum(axis=1)
-    rms = np.sqrt(np.sum(np.where(valid, residual**2, 0), axis=1) / np.maximum(seen, 1))
-    ok = (seen >= 3) & np.all(np.isfinite(x), axis=1)
-    agreed = np.sum(valid & (np.abs(residual) < 3 * noise), axis=1) / np.maximum(seen, 1)
+    seen_rows = np.maximum(valid.sum(axis=1), 1)
+    rms = np.sqrt(np.sum(np.where(valid, residual**2, 0), axis=1) / seen_rows)
+    ok = (valid.sum(axis=1) >= 3) & np.isfinite(x).all(axis=1)
+    agreed = np.sum(valid & (np.abs(residual) < 3 * noise), axis=1) / seen_rows
     return BoxFit(x[:, :3], x[:, 3:], np.asarray(np.linalg.inv(N)), rms, agreed, ok)
 
 
-def _corner_shares(outlines: Outlines) -> Array:
-    """How much (N, K, 8) of each corner is in the model points of N outlines."""
-    shares = np.zeros((*outlines.share.shape, 8))
-    n, k = np.ix_(*map(range, outlines.share.shape))
-    shares[n, k, outlines.corner[..., 0]] = 1 - outlines.share
-    shares[n, k, outlines.corner[..., 1]] = outlines.share
-    return shares
+def _rows(outlines: Outlines) -> Array:
+    """How far out N outlines expect the points of their rows, by corners: (N, K, 16), of eight u and then eight v."""
+    count, directions = outlines.share.shape
+    shares = np.zeros((count, directions, 1, 8))
+    n, k = np.arange(count)[:, None], np.arange(directions)
+    shares[n, k, 0, outlines.corner[..., 0]] = 1 - outlines.share
+    shares[n, k, 0, outlines.corner[..., 1]] = outlines.share
+    return np.asarray((outlines.normal[..., None] * shares).reshape(count, directions, 16))
+
+
+def _outermost(outlines: Outlines, image: Array) -> Array:
+    """The rows (n, K, 16) of tangents to n boxes whose corners are at `image` (n, 16) px."""
+    furthest = np.argmax(image.reshape(-1, 2, 8).swapaxes(1, 2) @ outlines.normal.swapaxes(1, 2), axis=1)
+    return np.asarray((outlines.normal[..., None] * np.eye(8)[furthest][:, :, None]).reshape(*furthest.shape, 16))
 
 
 def silhouette(camera: GroundCamera, pose: Array, size: Array) -> Array:
     """Outline (k, 2) px of one box: the hull of its projected corners, empty when it is behind the camera."""
-    pixels, _ = project(camera, corners(pose, size))
+    pixels = projected(camera, pose[None], size[None])[:, 0].T
     if not np.isfinite(pixels).all():
         return np.zeros((0, 2))
     return np.asarray(cv2.convexHull(pixels.astype(np.float32)), dtype=float).reshape(-1, 2)
