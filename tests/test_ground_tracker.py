@@ -82,7 +82,7 @@ def test_a_car_is_one_track_from_where_it_was_first_seen():
     distance, turned = error(track, tracker, truth)
     assert np.median(distance) < 0.25
     assert np.median(turned) < 0.05
-    path = conclude(track, CAMERA, tracker.settings, tracker.dynamics)
+    (path,) = conclude([track], CAMERA, tracker.settings, tracker.dynamics)
     speed = np.linalg.norm(path.planar.mean[10:-10, 2:], axis=1)
     np.testing.assert_allclose(speed, np.hypot(1.5, 12.0), rtol=0.03)
 

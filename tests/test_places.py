@@ -89,7 +89,8 @@ def test_nothing_outside_of_the_region_is_tracked(passing):
     square, settings, tracker, tracks = passing
     (track,) = tracks
     assert track.ended_by == "left the region"
-    path = Region(np.array(square)).part(conclude(track, CAMERA, settings, tracker.dynamics))
+    (whole,) = conclude([track], CAMERA, settings, tracker.dynamics)
+    path = Region(np.array(square)).part(whole)
     assert path is not None
     assert contains(np.array(square), path.planar.mean[:, :2]).all()
     assert np.ptp(path.planar.mean[:, 1]) > 10
@@ -116,7 +117,7 @@ def test_the_trusted_zone_ends_where_the_calibration_does():
 
 def test_a_track_outside_the_trusted_zone_is_rejected_with_that_reason(passing):
     _, settings, tracker, (track,) = passing
-    path = conclude(track, CAMERA, settings, tracker.dynamics)
+    (path,) = conclude([track], CAMERA, settings, tracker.dynamics)
     verdicts = [
         judge(path, CAMERA.ground.cov, 1.0, SpeedSettings(), np.full(len(path.t), zone)).reason
         for zone in (True, False)
@@ -128,7 +129,7 @@ def test_positions_ahead_are_where_the_car_is_then():
     truth = drive((-1, 14), (0.4, 9), np.arange(80) / 25)
     for settings in (TrackerSettings(latency=0.4), TrackerSettings(latency=0.4, smooth=False)):
         tracker, (track,) = follow(truth, settings)
-        path = conclude(track, CAMERA, settings, tracker.dynamics)
+        (path,) = conclude([track], CAMERA, settings, tracker.dynamics)
         late = path.frame + 10
         known = (late < len(truth)) & (np.arange(len(late)) > 12)
         error = np.linalg.norm(path.ahead[known] - truth[late[known], :2], axis=1)

@@ -75,9 +75,12 @@ class VideoSource:
                 frames.close()
         self._open.clear()
 
-    def frames(self) -> Iterator[Frame]:
-        """The frames within [start, end), times rising; raises InputError where there is none, or none is readable."""
-        frames = self._frames()
+    def frames(self, every: int = 1) -> Iterator[Frame]:
+        """The frames within [start, end), times rising; raises InputError where there is none, or none is readable.
+
+        With `every` only the first of each so many is converted and yielded; repeated pictures are then not told.
+        """
+        frames = self._frames(every)
         self._open.append(frames)
         return frames
 
@@ -85,11 +88,11 @@ class VideoSource:
         """What the last reading found out about the times and losses of the frames it yielded."""
         return self._auditor.result()
 
-    def _frames(self) -> Generator[Frame, None, None]:
+    def _frames(self, every: int) -> Generator[Frame, None, None]:
         auditor = self._auditor = TimeAuditor(self.path.name, self._reader.resolution_s)
         repeats = _RepeatDetector()
         last = -math.inf
-        backward = 0
+        backward = within = 0
         for index, t, picture in self._reader.pictures(auditor, -math.inf if self.start is None else self.start):
             if self.end is not None and t >= self.end:
                 break
@@ -99,7 +102,10 @@ class VideoSource:
                 continue
             last = t
             auditor.add(t)
-            auditor.duplicated += repeats.repeats(picture.raw)
+            within += 1
+            if (within - 1) % every:
+                continue
+            auditor.duplicated += every == 1 and repeats.repeats(picture.raw)
             yield Frame(self.camera, index, t, picture.bgr())
         if backward:
             auditor.warn(f"{backward} frames are stamped before the frame they follow and were left out")

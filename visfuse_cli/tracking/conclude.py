@@ -2,26 +2,23 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from visfuse_cli.maths import homography
-from visfuse_cli.maths.assignment import gate_size
 from visfuse_cli.maths.cameras import project
-from visfuse_cli.maths.gaussian import mahalanobis, symmetrise
+from visfuse_cli.maths.gaussian import symmetrise
 from visfuse_cli.records import Array, Gaussian, GroundCamera
 from visfuse_cli.tracking import dynamics as dynamics_tools
 from visfuse_cli.tracking import measure
 from visfuse_cli.tracking.dynamics import Dynamics, Step
+from visfuse_cli.tracking.refilter import filter_again, nis_of, settled_poses
 from visfuse_cli.tracking.settings import TrackerSettings
-from visfuse_cli.tracking.targets import Sample, Track
+from visfuse_cli.tracking.targets import Track
 from visfuse_cli.vision.wireframe import Outlines
-
-START_DOUBT = 5.0  # times the deviations a new track begins with
-SETTLING = 12  # measurements until that doubt is gone
-START_S, LEAST_START = 1.5, 5  # s, and measurements, from which the start is estimated
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,58 +55,109 @@ class Path:
     ahead: Array  # (T, 2) m: where it was expected a latency later, from what was known then
 
 
-def conclude(track: Track, camera: GroundCamera, settings: TrackerSettings, dynamics: Dynamics) -> Path:
-    """Settle a track's size, fit every frame again with it, and smooth; with `smooth` off, keep the causal states."""
-    samples, steps, misfit, noise = track.samples, track.steps, np.nan, 1.0
-    size, size_sigma, size_pull = track.size, track.size_sigma, np.zeros((len(samples), 2, 3))
-    nis = _nis(steps)
-    class_name = track.prior_class.name
-    measured = np.array([s.measured for s in samples])
-    if settings.smooth:
-        heading = dynamics.heading(dynamics_tools.smooth(dynamics, steps).mean)
-        rough = np.stack([step.posterior.mean for step in steps])
-        pose = np.column_stack([rough[:, :2], heading])
-        outlines = Outlines.stack([s.outline for s in samples])
-        used = measured
-        sized = measure.classify(camera, outlines[used], pose[used], settings.target.classes, settings.pose)[0]
-        class_name, size, size_sigma = sized.prior.name, sized.size, sized.size_sigma
-        fit = measure.fit_poses(camera, outlines, pose, size, np.full(3, 0.01), settings.pose)
-        size_pull = fit.cov[:, :2, 3:] @ np.linalg.inv(fit.cov[:, 3:, 3:])
-        misfit = float(np.median(fit.rms[used]))
-        steps, measured, noise = _filter_again(samples, steps, fit, pose, size, settings, dynamics)
-        nis = _nis(steps)
-        belief = dynamics_tools.smooth(dynamics, steps)
-    else:
-        belief = Gaussian(np.stack([s.posterior.mean for s in steps]), np.stack([s.posterior.cov for s in steps]))
+@dataclass(frozen=True, slots=True)
+class _Settled:
+    """What a track was found to be: see `Path`; `steps` are those of its filter, `belief` its states (T, n)."""
+
+    class_name: str
+    size: Array
+    size_sigma: Array
+    size_pull: Array
+    misfit_px: float
+    steps: list[Step]
+    measured: NDArray[np.bool_]
+    noise: float
+    belief: Gaussian
+
+
+def conclude(
+    tracks: Sequence[Track], camera: GroundCamera, settings: TrackerSettings, dynamics: Dynamics
+) -> list[Path]:
+    """Settle each track's size, fit every frame again with it, and smooth; with `smooth` off, keep the causal states.
+
+    A few tracks together take little longer than one.
+    """
+    settle = _settled if settings.smooth else _as_they_were
+    found = settle(tracks, camera, settings, dynamics)
+    return [_path(track, of, camera, settings, dynamics) for track, of in zip(tracks, found, strict=True)]
+
+
+def _path(track: Track, of: _Settled, camera: GroundCamera, settings: TrackerSettings, dynamics: Dynamics) -> Path:
+    samples, belief = track.samples, of.belief
     planar, J = dynamics.planar(belief.mean)
     pose_cov = symmetrise(J @ belief.cov @ np.swapaxes(J, -1, -2))
     calibration, pixel = _calibration(camera, planar)
     cov = symmetrise(pose_cov + calibration @ camera.ground.cov @ np.swapaxes(calibration, -1, -2))
     return Path(
         id=track.id,
-        class_name=class_name,
+        class_name=of.class_name,
         frame=np.array([s.frame for s in samples]),
         t=np.array([s.t for s in samples]),
-        measured=measured,
+        measured=of.measured,
         planar=Gaussian(planar, cov),
         pose_cov=pose_cov,
         heading=dynamics.heading(belief.mean),
-        size=size,
-        size_sigma=size_sigma,
-        size_pull=size_pull,
-        size_z=_size_z(size, class_name, settings),
+        size=of.size,
+        size_sigma=of.size_sigma,
+        size_pull=of.size_pull,
+        size_z=_size_z(of.size, of.class_name, settings),
         calibration=calibration,
         pixel=pixel,
-        nis=nis,
+        nis=nis_of(of.steps),
         nis_dof=len(dynamics.H),
-        noise=noise,
+        noise=of.noise,
         refused=track.refused,
         likeness=float(np.nanmean([s.border for s in samples if s.measured])),
         support=float(np.mean([s.outline.tangent or s.outline.valid.mean() for s in samples if s.measured])),
-        misfit_px=misfit,
+        misfit_px=of.misfit_px,
         ended_by=track.ended_by,
-        ahead=_ahead(steps, dynamics, settings.latency, float(size[0])),
+        ahead=_ahead(of.steps, dynamics, settings.latency, float(of.size[0])),
     )
+
+
+def _as_they_were(
+    tracks: Sequence[Track], camera: GroundCamera, settings: TrackerSettings, dynamics: Dynamics
+) -> list[_Settled]:
+    """What was known of each track in each of its frames."""
+    found = []
+    for track in tracks:
+        means, covs = (np.stack([getattr(step.posterior, name) for step in track.steps]) for name in ("mean", "cov"))
+        seen = np.array([sample.measured for sample in track.samples])
+        of = track.prior_class.name, track.size, track.size_sigma, np.zeros((len(seen), 2, 3)), np.nan
+        found.append(_Settled(*of, track.steps, seen, 1.0, Gaussian(means, covs)))
+    return found
+
+
+def _settled(
+    tracks: Sequence[Track], camera: GroundCamera, settings: TrackerSettings, dynamics: Dynamics
+) -> list[_Settled]:
+    """What all of each track says of it."""
+    fitted = [_fitted(track, camera, settings, dynamics) for track in tracks]
+    poses = [
+        settled_poses(track.samples, track.steps, fit, pose, sized.size, dynamics)
+        for track, (sized, pose, fit) in zip(tracks, fitted, strict=True)
+    ]
+    found = []
+    for track, (sized, _, fit), again in zip(tracks, fitted, filter_again(poses, settings, dynamics), strict=True):
+        seen = np.array([sample.measured for sample in track.samples])
+        pull = fit.cov[:, :2, 3:] @ np.linalg.inv(fit.cov[:, 3:, 3:])
+        of = sized.prior.name, sized.size, sized.size_sigma, pull, float(np.median(fit.rms[seen]))
+        belief = dynamics_tools.smooth(dynamics, again.steps)
+        found.append(_Settled(*of, again.steps, again.trusted, again.noise, belief))
+    return found
+
+
+def _fitted(
+    track: Track, camera: GroundCamera, settings: TrackerSettings, dynamics: Dynamics
+) -> tuple[measure.Sized, Array, measure.BoxFit]:
+    """A track's class and size, its poses (T, 3) as they are smoothed with what was known, and boxes fitted anew."""
+    heading = dynamics.heading(dynamics_tools.smooth(dynamics, track.steps).mean)
+    rough = np.stack([step.posterior.mean for step in track.steps])
+    pose = np.column_stack([rough[:, :2], heading])
+    outlines = Outlines.stack([sample.outline for sample in track.samples])
+    used = np.array([sample.measured for sample in track.samples])
+    sized = measure.classify(camera, outlines[used], pose[used], settings.target.classes, settings.pose)[0]
+    return sized, pose, measure.fit_poses(camera, outlines, pose, sized.size, np.full(3, 0.01), settings.pose)
 
 
 def _ahead(steps: list[Step], dynamics: Dynamics, latency: float, length: float) -> Array:
@@ -125,86 +173,6 @@ def _size_z(size: Array, class_name: str, settings: TrackerSettings) -> float:
     prior = next(c for c in settings.target.classes if c.name == class_name)
     mean, sigma = measure.prior_arrays(prior)
     return float(np.linalg.norm((size - mean) / sigma))
-
-
-def _nis(steps: list[Step]) -> Array:
-    return np.array([float(step.innovation.nis) for step in steps if step.innovation is not None])
-
-
-def _filter_again(
-    samples: list[Sample],
-    steps: list[Step],
-    fit: measure.BoxFit,
-    pose: Array,
-    size: Array,
-    settings: TrackerSettings,
-    dynamics: Dynamics,
-) -> tuple[list[Step], NDArray[np.bool_], float]:
-    """Filter the settled poses; a second time with the noise that the innovations of the whole track speak of.
-
-    Returns that noise too, as a share of what was expected.
-    """
-    measured = [
-        dynamics.measured(*measure.measurement(fit, k, pose[k])) if samples[k].measured and fit.ok[k] else None
-        for k in range(len(samples))
-    ]
-    scale, start = 1.0, _start(samples, measured, pose, dynamics) or steps[0].posterior
-    for _ in range(2 if settings.filter.adapt_noise else 1):
-        steps, trusted = _filter(samples, start, measured, scale, float(size[0]), settings, dynamics)
-        nis = _nis(steps)
-        if len(nis) >= 5:
-            scale *= float(np.clip(np.mean(nis) / len(dynamics.H), 0.2, 25.0))
-    return steps, trusted, scale
-
-
-def _start(
-    samples: list[Sample], measured: list[tuple[Array, Array] | None], pose: Array, dynamics: Dynamics
-) -> Gaussian | None:
-    """Where and how fast a track began, by medians over its first measurements: what enters is badly seen at first."""
-    t = np.array([sample.t for sample in samples])
-    used = np.array([z is not None for z in measured]) & (t - t[0] <= START_S)
-    if np.count_nonzero(used) < LEAST_START:
-        return None
-    elapsed = t[used] - t[0]
-    position = np.array([z[0][:2] for z, chosen in zip(measured, used, strict=True) if z is not None and chosen])
-    i, j = np.triu_indices(len(elapsed), 1)
-    velocity = np.median((position[j] - position[i]) / (elapsed[j] - elapsed[i])[:, None], axis=0)
-    begin = np.median(position - elapsed[:, None] * velocity, axis=0)
-    heading = np.arctan2(np.median(np.sin(pose[used, 2])), np.median(np.cos(pose[used, 2])))
-    return dynamics.begin(np.append(begin, heading), velocity)
-
-
-def _filter(
-    samples: list[Sample],
-    start: Gaussian,
-    measured: list[tuple[Array, Array] | None],
-    scale: float,
-    length: float,
-    settings: TrackerSettings,
-    dynamics: Dynamics,
-) -> tuple[list[Step], NDArray[np.bool_]]:
-    """One pass over settled poses, and which of them lay inside the gate; it begins knowing nearly nothing."""
-    gate = gate_size(len(dynamics.H), settings.pose.gate)
-    H = dynamics.H
-    steps = [dynamics_tools.first(dynamics, Gaussian(start.mean, start.cov * START_DOUBT**2))]
-    trusted = np.zeros(len(samples), dtype=bool)
-    count = 0
-    for k, now in enumerate(measured):
-        dt = np.array([samples[k].t - samples[k - 1].t if k else 0.0])
-        # The record of residuals begins when the belief has settled: the first doubt is no sign of a manoeuvre.
-        before = steps[-1] if count > SETTLING else replace(steps[-1], memory=None)
-        expected = dynamics_tools.predict(dynamics, [before], dt, np.array([length]))[0]
-        step = dynamics_tools.coast(expected)
-        if now is not None:
-            z, R = now[0], now[1] * scale
-            gamma = dynamics_tools.residual(dynamics, z, expected.prior.mean)
-            nis = float(mahalanobis(gamma, H @ expected.prior.cov @ H.T + R))
-            # Outside the gate a measurement counts less the further off it is: a bad start is left behind in the end.
-            step = dynamics_tools.take(dynamics, expected, z, R * max(1.0, nis / gate) ** 2)
-            trusted[k] = nis < gate
-            count += 1
-        steps.append(step)
-    return steps[1:], trusted
 
 
 def _calibration(camera: GroundCamera, planar: Array) -> tuple[Array, Array]:

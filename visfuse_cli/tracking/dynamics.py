@@ -199,7 +199,7 @@ def predict(dynamics: Dynamics, steps: Sequence[Step], dt: Array, length: Array)
     """Advance N targets from their latest steps by dt (N,) s; length (N,) m is each target's own."""
     if dynamics.log_p is not None:
         return _predict_models(dynamics, steps, dt, length)
-    before = _stacked([step.posterior for step in steps])
+    before = stacked([step.posterior for step in steps])
     mean, F, Q = dynamics.advance(before.mean, before.cov, dt, length)
     cov = gaussian.propagate(before.cov, F, Q)
     return [Prediction(Gaussian(mean[k], cov[k]), F[k], Q[k], step.memory) for k, step in enumerate(steps)]
@@ -208,7 +208,7 @@ def predict(dynamics: Dynamics, steps: Sequence[Step], dt: Array, length: Array)
 def _predict_models(dynamics: Dynamics, steps: Sequence[Step], dt: Array, length: Array) -> list[Prediction]:
     assert dynamics.log_p is not None
     banks = [step.models.filtered for step in steps if step.models is not None]
-    bank = imm.Bank(_stacked([each.beliefs for each in banks]), np.stack([each.log_mu for each in banks]))
+    bank = imm.Bank(stacked([each.beliefs for each in banks]), np.stack([each.log_mu for each in banks]))
     ahead = imm.predict(bank, dynamics.log_p, lambda x: dynamics.advance(x, x, dt, length), dynamics.angles_x)
     prior = imm.combined(ahead.filtered, dynamics.angles_x)
     return [
@@ -251,6 +251,37 @@ def take(dynamics: Dynamics, prediction: Prediction, z: Array, R: Array) -> Step
     return Step(taken.prior, posterior, prediction.F, taken.innovation, taken.state)
 
 
+def take_each(dynamics: Dynamics, predictions: Sequence[Prediction], z: Array, R: Array) -> list[Step]:
+    """Take in the measurements z (N, m) with noise R (N, m, m) of N targets, as `take` does of one."""
+    prior = stacked([each.prior for each in predictions])
+    F, Q = (np.array([getattr(each, name) for each in predictions]) for name in ("F", "Q"))
+    models, memory = None, None
+    if dynamics.log_p is not None:
+        models = _together([each.models for each in predictions if each.models is not None])
+    else:
+        each_memory = [p.memory or fading.start(p.prior, dynamics.H, R[k]) for k, p in enumerate(predictions)]
+        memory = fading.FadingState(np.array([each.U for each in each_memory]))
+    whole = take(dynamics, Prediction(prior, F, Q, memory, models), z, R)
+    return [_one(whole, k) for k in range(len(predictions))]
+
+
+def _together(steps: Sequence[imm.Step]) -> imm.Step:
+    """The steps of several targets as one, target first."""
+    mixed, predicted, after = (
+        stacked(beliefs) for beliefs in zip(*((s.mixed, s.predicted, s.filtered.beliefs) for s in steps), strict=True)
+    )
+    F, Q, ahead = (np.array([getattr(s, name) for s in steps]) for name in ("F", "Q", "ahead"))
+    return imm.Step(mixed, F, Q, predicted, ahead, imm.Bank(after, np.array([s.filtered.log_mu for s in steps])))
+
+
+def _one(step: Step, k: int) -> Step:
+    """The step of the k-th of several targets."""
+    prior, posterior = (Gaussian(b.mean[k], b.cov[k]) for b in (step.prior, step.posterior))
+    said = step.innovation and Innovation(*(getattr(step.innovation, name)[k] for name in Innovation.__slots__))
+    memory = step.memory and fading.FadingState(step.memory.U[k])
+    return Step(prior, posterior, step.F[k], said, memory, step.models and imm.at(step.models, k))
+
+
 def take_speed(dynamics: Dynamics, step: Step, along: Array, speed: float, sigma: float) -> Step:
     """Take in the speed (m/s, deviation sigma) of one target along a direction (2,), unless it is beyond belief."""
     belief = step.posterior if step.models is None else step.models.filtered.beliefs
@@ -271,10 +302,11 @@ def smooth(dynamics: Dynamics, steps: Sequence[Step]) -> Gaussian:
     """The states (T, n) of a finished track given all of it."""
     if dynamics.log_p is not None:
         banks = imm.smooth([step.models for step in steps if step.models], dynamics.log_p, dynamics.angles_x)
-        return _stacked([imm.combined(bank, dynamics.angles_x) for bank in banks])
-    filtered, predicted = _stacked([s.posterior for s in steps]), _stacked([s.prior for s in steps])
+        return stacked([imm.combined(bank, dynamics.angles_x) for bank in banks])
+    filtered, predicted = stacked([s.posterior for s in steps]), stacked([s.prior for s in steps])
     return rauch_tung_striebel(filtered, predicted, np.stack([s.F for s in steps]), dynamics.angles_x)
 
 
-def _stacked(beliefs: Sequence[Gaussian]) -> Gaussian:
+def stacked(beliefs: Sequence[Gaussian]) -> Gaussian:
+    """N beliefs (n,) as one (N, n)."""
     return Gaussian(np.array([belief.mean for belief in beliefs]), np.array([belief.cov for belief in beliefs]))

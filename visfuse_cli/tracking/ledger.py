@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
 from typing import Any
@@ -12,7 +12,7 @@ import numpy as np
 from visfuse_cli.maths.cameras import project
 from visfuse_cli.maths.polygons import Polygon
 from visfuse_cli.records import Array, GroundCamera
-from visfuse_cli.tracking.conclude import conclude
+from visfuse_cli.tracking.conclude import Path, conclude
 from visfuse_cli.tracking.dynamics import Dynamics
 from visfuse_cli.tracking.headlights import REASON
 from visfuse_cli.tracking.lanes import Way, find_lanes, lane_of, thinned
@@ -48,10 +48,20 @@ class Ledger:
         self._region = Region(np.array(config.region)) if config.region else None
         self._ways: dict[int, Way] = {}  # track -> where it drove while it was measured
 
-    def take(self, track: Track, of: Recording, dynamics: Dynamics, only_light: bool) -> dict[str, Any] | None:
-        """Conclude and judge a track; its record for tracks.json, None where it never was in the region."""
+    def take(
+        self, tracks: Sequence[Track], of: Recording, dynamics: Dynamics, only_light: Callable[[int], bool]
+    ) -> Iterator[dict[str, Any]]:
+        """Conclude and judge tracks; their records for tracks.json, but of those that never were in the region.
+
+        `only_light` tells of an id whether no more than lamps was seen of it.
+        """
+        for whole in conclude(tracks, of.camera, self._config, dynamics):
+            record = self._judged(whole, of, only_light(whole.id))
+            if record is not None:
+                yield record
+
+    def _judged(self, whole: Path, of: Recording, only_light: bool) -> dict[str, Any] | None:
         config, camera = self._config, of.camera
-        whole = conclude(track, camera, config, dynamics)
         path = whole if self._region is None else self._region.part(whole)
         if path is None:
             return None

@@ -28,6 +28,7 @@ from visfuse_cli.vision.empty import empty_picture
 from visfuse_cli.vision.steady import at_rest
 
 WARMUP_PICTURES = 31
+TOGETHER = 1000  # frames of tracks that have ended wait for one another: settling them at once takes less time
 STEADIED_PX = 0.3  # what is left of a shake between two pictures, at most
 
 
@@ -67,6 +68,7 @@ def follow(clip: Clip, run_: Run, spool: TrackSpool, findings: Findings, first_i
             look, lamps = _detector(clip, empty, look_over), Headlights(empty, clip.camera)
         tracker = GroundTracker(clip.camera, clip.config, first_id, follow_corners)
         of = Recording(clip.name, label, clip.camera, findings.began[clip.name], watch.image_from_rest)
+        settling = _Settling(of, tracker, lamps, run_, spool, findings.ledger)
         for frame, following in with_next(_steadied(clip.source, watch, run_)):
             tracker.predict(frame.t)
             with run_.stage("detect"):
@@ -79,10 +81,10 @@ def follow(clip: Clip, run_: Run, spool: TrackSpool, findings: Findings, first_i
                     strangers.add(frame.index, tracker.unexplained)
                 lamps.look(frame, tracker.tracks, tracker.headings())
             with run_.stage("conclude"):
-                _settle(*ended, of, tracker, lamps, run_, spool, findings.ledger)
+                settling.take(*ended)
             with run_.stage("learn"):
                 look.learn(frame, tracker)
-        _settle(*tracker.finish(), of, tracker, lamps, run_, spool, findings.ledger)
+        settling.take(*tracker.finish(), last=True)
     give_back()
     findings.suns[clip.name] = look.report()
     audit = findings.audits[clip.name] = clip.source.audit()
@@ -123,30 +125,33 @@ def sampled(source: VideoSource, warmup_s: float) -> Iterator[Any]:
         span = min(span, source.frame_count)
     step = max(1, round(span / WARMUP_PICTURES))
     first: float | None = None
-    for number, frame in enumerate(source.frames()):
-        first = frame.t if first is None else first
-        if number and frame.t - first >= warmup_s:
+    for frame in source.frames(step):
+        if first is not None and frame.t - first >= warmup_s:
             return
-        if number % step == 0:
-            yield frame.image
+        first = frame.t if first is None else first
+        yield frame.image
 
 
-def _settle(
-    tracks: list[Track],
-    abandoned: list[Abandoned],
-    of: Recording,
-    tracker: GroundTracker,
-    lamps: Headlights,
-    run_: Run,
-    spool: TrackSpool,
-    ledger: Ledger,
-) -> None:
-    """Turn what ended into records and table rows."""
-    for track in tracks:
-        record = ledger.take(track, of, tracker.dynamics, lamps.only_light(track.id))
-        if record is not None:
-            spool.add(record)
-            run_.count("rejected" if record["summary"]["rejected"] else "vehicles")
-    for candidate in abandoned:
-        ledger.give_up(candidate, of)
-        run_.count("regions that never became a track")
+@dataclass(slots=True)
+class _Settling:
+    """Turns what ended into records and table rows, a few tracks at a time."""
+
+    of: Recording
+    tracker: GroundTracker
+    lamps: Headlights
+    run: Run
+    spool: TrackSpool
+    ledger: Ledger
+    waiting: list[Track] = field(default_factory=list)
+
+    def take(self, tracks: list[Track], abandoned: list[Abandoned], last: bool = False) -> None:
+        """Take in what ended; with the `last` of it nothing waits any longer."""
+        for candidate in abandoned:
+            self.ledger.give_up(candidate, self.of)
+            self.run.count("regions that never became a track")
+        self.waiting += tracks
+        if self.waiting and (last or sum(len(track.samples) for track in self.waiting) >= TOGETHER):
+            for record in self.ledger.take(self.waiting, self.of, self.tracker.dynamics, self.lamps.only_light):
+                self.spool.add(record)
+                self.run.count("rejected" if record["summary"]["rejected"] else "vehicles")
+            self.waiting = []
