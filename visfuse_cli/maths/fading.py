@@ -58,12 +58,12 @@ def fading_factor(
     weights = np.asarray(alpha, dtype=float)
 
     def weighted_trace(matrix: Array) -> Array:
-        return np.sum(weights * np.diagonal(matrix, axis1=-2, axis2=-1), axis=-1)
+        return np.asarray(matrix.diagonal(0, -2, -1) @ weights)
 
     N = weighted_trace(U - H @ Q @ transpose(H) - softening * R)
     M = weighted_trace(H @ spread @ transpose(H))
     # The divisor is kept where the quotient stays within the limit, so that an exactly known past cannot overflow it.
-    return np.clip(N / np.maximum(M, np.abs(N) / limit + TINY), 1.0, limit)
+    return np.asarray(np.minimum(np.maximum(N / np.maximum(M, np.abs(N) / limit + TINY), 1.0), limit))
 
 
 def update(

@@ -131,7 +131,7 @@ def bicycle(x: Array, dt: ArrayLike, wheelbase: ArrayLike, straighten: float = 0
     side's, so that a filter at the limit can still turn back. Exact: the rear axle runs along a circle. Where drivers
     `straighten` up (1/s), phi goes back to zero at that rate and the circle is that of its mean over the step.
     """
-    v, theta, phi = x[..., 2], x[..., 3], np.clip(x[..., 4], -STEERING_LIMIT, STEERING_LIMIT)
+    v, theta, phi = x[..., 2], x[..., 3], _within_limit(x[..., 4])
     dt, wheelbase = np.asarray(dt, dtype=float), np.asarray(wheelbase, dtype=float)
     decay = straighten * dt
     on_average = np.where(decay > 1e-6, -np.expm1(-decay) / np.maximum(decay, 1e-6), 1 - decay / 2)
@@ -196,7 +196,7 @@ def bicycle_step(
     by_speed, by_steering = np.asarray(sigma_a) ** 2.0, np.asarray(sigma_steer) ** 2.0
     density = np.empty((*np.broadcast_shapes(by_speed.shape, by_steering.shape), 2))
     density[..., 0], density[..., 1] = by_speed, by_steering
-    dt = np.broadcast_to(dt, np.broadcast_shapes(x.shape[:-1], dt.shape))
+    dt = dt + np.zeros(x.shape[:-1])
     left = dt * STRIKES.reshape(4, *[1] * dt.ndim)  # when noise strikes, s before the end
     moved, F = bicycle(x, left, wheelbase, straighten)
     from_start, gained = F[:-1, ..., 2::2], wrap(moved[-2::-1, ..., 3] - x[..., 3])  # the nodes are symmetric
@@ -210,12 +210,16 @@ def bicycle_step(
     return moved[-1].copy(), F[-1].copy(), symmetrise(mean_rate * dt[..., None, None])
 
 
+def _within_limit(phi: Array) -> Array:
+    return np.asarray(np.minimum(np.maximum(phi, -STEERING_LIMIT), STEERING_LIMIT))
+
+
 def bicycle_velocity(x: Array) -> tuple[Array, Array]:
     """Velocity of the car's centre (..., 2) m/s for states (..., 5), and its Jacobian (..., 2, 5). Lou 2002, eq. 1.
 
     Its length is |v| sqrt(1 + 3 cos^2 phi) / (2 cos phi), its direction theta + atan(tan(phi) / 2).
     """
-    v, theta, phi = x[..., 2, None], x[..., 3], np.clip(x[..., 4, None], -STEERING_LIMIT, STEERING_LIMIT)
+    v, theta, phi = x[..., 2, None], x[..., 3], _within_limit(x[..., 4, None])
     along, across = axes(theta)
     half = np.tan(phi) / 2
     J = np.zeros((*x.shape[:-1], 2, 5))
@@ -233,8 +237,8 @@ def axes(heading: Array) -> tuple[Array, Array]:
 
 def sinc(x: Array) -> tuple[Array, Array]:
     """sin(x)/x and its derivative, by series where the quotients would cancel."""
-    small = np.abs(x) < 1e-2
-    value, slope = 1 - x**2 / 6 + x**4 / 120, -x / 3 + x**3 / 30 - x**5 / 840
+    small, square = np.abs(x) < 1e-2, x * x
+    value, slope = 1 - square * (1 / 6 - square / 120), -x * (1 / 3 - square * (1 / 30 - square / 840))
     if not small.all():
         safe = np.where(small, 1.0, x)
         value = np.where(small, value, np.sin(safe) / safe)

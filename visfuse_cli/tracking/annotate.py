@@ -83,19 +83,19 @@ class _Place:
         ends = np.concatenate([polygon, polygon[:1]])
         length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(ends, axis=0), axis=1))])
         places = np.linspace(0, length[-1], max(2, min(400, round(length[-1] / PLACE_STEP_M))))
-        dense = np.column_stack([np.interp(places, length, ends[:, k]) for k in (0, 1)])
-        self._name, self._line = name, _on_image(camera, dense)
+        line = _on_image(camera, np.column_stack([np.interp(places, length, ends[:, k]) for k in (0, 1)]))
+        size = np.array(camera.image_size)
+        shown = np.asarray(np.isfinite(line).all(axis=1) & (np.abs(line) < 3 * size).all(axis=1))
+        parts = np.split(np.arange(len(line)), np.flatnonzero(np.diff(shown)) + 1)
+        self._name, self._parts = name, [line[part] for part in parts if shown[part[0]]]
+        inside = line[shown & (line >= 0).all(axis=1) & (line < size).all(axis=1)]
+        self._middle = inside.mean(axis=0) if len(inside) else None
 
     def draw(self, image: Image, image_from_rest: Array) -> None:
-        line = moved(image_from_rest, self._line)
-        size = np.array(image.shape[1::-1])
-        shown = np.asarray(np.isfinite(line).all(axis=1) & (np.abs(line) < 3 * size).all(axis=1))
-        for part in np.split(np.arange(len(line)), np.flatnonzero(np.diff(shown)) + 1):
-            if shown[part[0]]:
-                drawing.polyline(image, line[part], PALE, width=1)
-        inside = line[shown & (line >= 0).all(axis=1) & (line < size).all(axis=1)]
-        if len(inside):
-            drawing.label(image, self._name, inside.mean(axis=0), PALE, 0.8)
+        for part in self._parts:
+            drawing.polyline(image, moved(image_from_rest, part), PALE, width=1)
+        if self._middle is not None:
+            drawing.label(image, self._name, moved(image_from_rest, self._middle), PALE, 0.8)
 
 
 def annotate(

@@ -39,12 +39,18 @@ def paces(camera: GroundCamera, pose: Array, size: Array, expected: Array, moves
         if np.count_nonzero(mine) < LEAST:
             continue
         each = along[mine] / moves.dt
-        middle = float(np.median(each))
-        spread = 1.5 * float(np.median(np.abs(each - middle)))
-        doubt = max(spread, float(np.median(noise[mine])) / moves.dt) / np.sqrt(len(each))
+        middle = _median(each)
+        spread = 1.5 * _median(np.abs(each - middle))
+        doubt = max(spread, _median(noise[mine]) / moves.dt) / np.sqrt(len(each))
         surface = SURFACE * max(abs(middle), abs(expected[k]))
         speed[k], sigma[k] = middle, np.sqrt(doubt**2 + surface**2 + SETTLED**2)
     return speed, sigma
+
+
+def _median(values: Array) -> float:
+    """The median of a few values (n,), in a tenth of the time that numpy takes for all of its cases."""
+    ordered = np.sort(values)
+    return float(ordered[(len(values) - 1) // 2] + ordered[len(values) // 2]) / 2
 
 
 def _inverse(J: Array) -> Array:
@@ -57,19 +63,20 @@ def _inverse(J: Array) -> Array:
 def _on_boxes(camera: GroundCamera, pose: Array, size: Array, pixels: Array) -> tuple[Array, Array]:
     """Where (n, 3) m the lines of sight through pixels (n, 2) first meet a box, and which one (n,); -1: none."""
     H, centre = camera.ground.ground_from_image, camera.centre
-    foot = np.column_stack([pixels, np.ones(len(pixels))]) @ H.T
+    foot = pixels @ H[:, :2].T + H[:, 2]
     sight = np.column_stack([foot[:, :2] / foot[:, 2:] - centre[:2], np.full(len(pixels), -centre[2])])
-    c, s = np.cos(pose[:, 2]), np.sin(pose[:, 2])
-    turn = np.stack([np.stack([c, s], axis=-1), np.stack([-s, c], axis=-1)], axis=-2)  # (N, 2, 2) into the box
-    start = np.einsum("nij,nj->ni", turn, centre[:2] - pose[:, :2])
-    start = np.column_stack([start, np.full(len(pose), centre[2])])[:, None]
-    towards = np.einsum("nij,mj->nmi", turn, sight[:, :2])
-    towards = np.concatenate([towards, np.broadcast_to(sight[:, 2:], (*towards.shape[:2], 1))], axis=-1)
-    towards = np.where(np.abs(towards) < 1e-9, 1e-9, towards)
-    low = np.column_stack([-size[:, :2] / 2, np.zeros(len(size))])[:, None]
-    high = np.column_stack([size[:, :2] / 2, size[:, 2]])[:, None]
-    ends = np.stack([(low - start) / towards, (high - start) / towards])
-    enters, leaves = ends.min(axis=0).max(axis=-1), ends.max(axis=0).min(axis=-1)
+    c, s = np.cos(pose[:, 2, None]), np.sin(pose[:, 2, None])
+    off = centre[:2] - pose[:, :2]
+    # From the camera, and on along the lines of sight, in the axes of each box: (N, 1) and (N, n).
+    from_camera = [c * off[:, :1] + s * off[:, 1:], c * off[:, 1:] - s * off[:, :1], np.full_like(c, centre[2])]
+    along_sight = [c * sight[:, 0] + s * sight[:, 1], c * sight[:, 1] - s * sight[:, 0], sight[:, 2]]
+    faces = [(-size[:, 0] / 2, size[:, 0] / 2), (-size[:, 1] / 2, size[:, 1] / 2), (0 * size[:, 2], size[:, 2])]
+    enters, leaves = np.full((len(pose), len(pixels)), -np.inf), np.full((len(pose), len(pixels)), np.inf)
+    for start, way, (low, high) in zip(from_camera, along_sight, faces, strict=True):
+        way = np.where(np.abs(way) < 1e-9, 1e-9, way)
+        one, other = (low[:, None] - start) / way, (high[:, None] - start) / way
+        enters = np.maximum(enters, np.minimum(one, other))
+        leaves = np.minimum(leaves, np.maximum(one, other))
     meets = np.where((enters <= leaves) & (enters > 0), enters, np.inf)
     owner = np.argmin(meets, axis=0)
     nearest = meets[owner, np.arange(len(pixels))]

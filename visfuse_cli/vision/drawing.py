@@ -11,6 +11,7 @@ from visfuse_cli.records import Array, Image
 from visfuse_cli.vision.wireframe import EDGES
 
 SHIFT = 4  # sub-pixel bits of OpenCV's drawing coordinates
+DIMMED = (np.arange(256) * 0.35).astype(np.uint8)  # what lies behind writing
 Colour = tuple[int, int, int]
 
 
@@ -55,6 +56,5 @@ def label(image: Image, text: str, at: Array, colour: Colour, scale: float = 1.0
     x = int(np.clip(at[0], pad, max(pad, width - w - pad)))
     y = int(np.clip(at[1], h + pad, max(h + pad, height - baseline - pad)))
     left, top, right, bottom = max(0, x - pad), max(0, y - h - pad), x + w + pad, y + baseline + pad // 2
-    plate = image[top:bottom, left:right]
-    np.copyto(plate, (plate * 0.35).astype(np.uint8))
+    image[top:bottom, left:right] = cv2.LUT(image[top:bottom, left:right], DIMMED)
     cv2.putText(image, text, (x, y), cv2.FONT_HERSHEY_SIMPLEX, size, colour, thick, cv2.LINE_AA)

@@ -139,20 +139,26 @@ class _Components:
     """The connected parts of a mask (1), found one by one as they are asked for."""
 
     def __init__(self, mask: Image) -> None:
-        self._number = mask.astype(np.int32)
+        self._left, self._top, wide, high = cv2.boundingRect(mask)
+        self._number = mask[self._top : self._top + high, self._left : self._left + wide].astype(np.int32)
         self._extent: list[tuple[Array, float]] = []
 
     def around(self, points: NDArray[np.int32]) -> tuple[int, Array, float] | None:
         """Number, box (4,) px and area px^2 of the part that `points` (k, 2) of a contour lie in; None if in none."""
-        inside = points[self._number[points[:, 1], points[:, 0]] > 0]
+        u, v = points[:, 0] - self._left, points[:, 1] - self._top
+        high, wide = self._number.shape
+        within = (u >= 0) & (u < wide) & (v >= 0) & (v < high)
+        u, v = u[within], v[within]
+        inside = np.flatnonzero(self._number[v, u])
         if not len(inside):
             return None
-        u, v = inside[len(inside) // 2]
-        if self._number[v, u] == 1:
+        middle = inside[len(inside) // 2]
+        at = int(u[middle]), int(v[middle])
+        if self._number[at[::-1]] == 1:
             number = len(self._extent) + 2
-            area, _, _, rect = cv2.floodFill(self._number, None, (int(u), int(v)), number, flags=4)
-            self._extent.append((np.array(rect) - [0.5, 0.5, 0, 0], float(area)))
-        number = int(self._number[v, u])
+            area, _, _, (x, y, w, h) = cv2.floodFill(self._number, None, at, number, flags=4)
+            self._extent.append((np.array([x + self._left - 0.5, y + self._top - 0.5, w, h]), float(area)))
+        number = int(self._number[at[::-1]])
         return number, *self._extent[number - 2]
 
 

@@ -169,12 +169,13 @@ def _turn(here: NDArray[np.float32], there: NDArray[np.float32], sharpness: Arra
     ones, none = np.ones_like(u), np.zeros_like(u)
     J = np.stack([np.stack([ones, none, -v], axis=-1), np.stack([none, ones, u], axis=-1)], axis=1)  # (k, 2, 3)
     off = (there - here).astype(float)
+    J_G = J.transpose(0, 2, 1) @ sharpness  # (k, 3, 2)
+    squares, wanted = (J_G @ J).reshape(-1, 9), (J_G @ off[..., None])[..., 0]
     step, weight = np.zeros(3), ones
     for _ in range(ROUNDS):
-        J_G = J.transpose(0, 2, 1) @ sharpness * weight[:, None, None]
-        step = np.linalg.solve((J_G @ J).sum(axis=0), (J_G @ off[..., None]).sum(axis=0)[:, 0])
+        step = np.linalg.solve((weight @ squares).reshape(3, 3), weight @ wanted)
         error = off - J @ step
-        size = np.einsum("ki,kij,kj->k", error, sharpness, error)
+        size = np.sum((error[:, None] @ sharpness)[:, 0] * error, axis=1)
         weight = 1 / (1 + size / max(float(np.median(size)), 1e-12))
     R = np.array([[np.cos(step[2]), -np.sin(step[2])], [np.sin(step[2]), np.cos(step[2])]])
     return np.vstack([np.column_stack([R, step[:2] + middle - R @ middle]), [0, 0, 1]])
