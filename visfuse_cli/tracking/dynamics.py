@@ -277,7 +277,8 @@ def _together(steps: Sequence[imm.Step]) -> imm.Step:
 def _one(step: Step, k: int) -> Step:
     """The step of the k-th of several targets."""
     prior, posterior = (Gaussian(b.mean[k], b.cov[k]) for b in (step.prior, step.posterior))
-    said = step.innovation and Innovation(*(getattr(step.innovation, name)[k] for name in Innovation.__slots__))
+    whole = step.innovation
+    said = whole and Innovation(whole.residual[k], whole.cov[k], whole.nis[k], whole.log_likelihood[k])
     memory = step.memory and fading.FadingState(step.memory.U[k])
     return Step(prior, posterior, step.F[k], said, memory, step.models and imm.at(step.models, k))
 

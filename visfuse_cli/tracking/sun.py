@@ -157,7 +157,7 @@ class Shade:
         places = cv2.findNonZero(cv2.bitwise_and(where, labels))
         if places is None:
             return labels
-        u, v = places[:, 0].T
+        u, v = places.reshape(-1, 2).T
         seen, lit = image[v, u].astype(np.float32), empty[v, u].astype(np.float32)
         share = seen.sum(axis=1) / np.maximum(lit.sum(axis=1), 1.0)
         grey = np.abs(seen - share[:, None] * lit).max(axis=1) < COLOUR
