@@ -83,6 +83,10 @@ def _left(track: Track, region: Region) -> bool:
 
 def _twins(tracks: list[Track], pose: Array, size: Array) -> dict[int, Track]:
     """The tracks (by number) in whose place another one stands that looks more like a vehicle, and that one."""
+    apart = np.hypot(*(pose[:, None, :2] - pose[None, :, :2]).T)
+    reach = np.hypot(*size[:, :2].T) / 2
+    if np.count_nonzero(apart < reach[:, None] + reach) == len(tracks):  # nobody is near anybody else
+        return {}
     shared = footprint_overlap(pose, size, pose, size) > ONE_PLACE
     worth = [(round(track.likeness, 1), len(track.samples)) for track in tracks]
     found: dict[int, Track] = {}

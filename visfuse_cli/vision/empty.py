@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from functools import reduce
 from typing import Any
 
 import cv2
@@ -51,8 +52,7 @@ def empty_picture(images: Sequence[Image], moved_px: float = 0.0, neighbours: bo
     sure = (often >= SURE * len(images)) & ~in_shadow
     if not sure.all():
         around = _surroundings(colour, sure.astype(np.float32))
-        off = np.abs(blocks - around.astype(np.float32)).max(axis=-1)
-        dark_off = np.abs(colour - around).max(axis=-1)
+        off, dark_off = _off(blocks, around.astype(np.float32)), _off(colour, around)
         in_light = in_shadow & (_mean(off, lit) < dark_off + UNLIKE)
         shows[:, in_light] = lit[:, in_light]
         beside = _shown_beside(shows, sure | in_light)
@@ -70,6 +70,13 @@ def empty_picture(images: Sequence[Image], moved_px: float = 0.0, neighbours: bo
         cv2.accumulate(image, total, mask)
         count += mask
     return np.asarray(np.rint(total / count[..., None]), dtype=np.uint8)
+
+
+def _off(colours: NDArray[Any], others: Array | Iterable[Array]) -> Array:
+    """How far apart (...) colours (..., 3) are in the channel in which that is most; the others may come by channel."""
+    channels = np.moveaxis(others, -1, 0) if isinstance(others, np.ndarray) else others
+    apart = (np.abs(colours[..., k] - channel) for k, channel in enumerate(channels))
+    return reduce(np.maximum, apart)
 
 
 def _tolerance(blocks: Image, moved_px: float) -> Image:
@@ -126,7 +133,7 @@ def _lit(blocks: Image, colour: Array) -> tuple[NDArray[np.bool_], NDArray[np.bo
     """
     length = np.maximum(np.sum(colour**2, axis=-1), 1.0)
     ratio = np.einsum("nvuc,vuc->nvu", blocks, colour) / length
-    off = np.abs(blocks - ratio[..., None] * colour).max(axis=-1)
+    off = _off(blocks, (ratio * colour[..., channel] for channel in range(3)))
     brighter = (ratio > LIT[0]) & (ratio < LIT[1]) & (off < SAME_HUE)
     if not brighter.any() or np.median(colour) < NIGHT:
         return np.zeros_like(brighter), np.zeros_like(brighter)
