@@ -7,13 +7,14 @@ from dataclasses import dataclass, field
 from datetime import datetime
 from typing import Any
 
+import cv2
 import numpy as np
 
 from visfuse_cli.files.spool import TrackSpool
 from visfuse_cli.files.video import VideoSource
 from visfuse_cli.pipeline import Run, ahead, helper, with_next
 from visfuse_cli.records import Array, Frame, GroundCamera, Image, TimeAudit
-from visfuse_cli.threads import give_back
+from visfuse_cli.threads import give_back, thread_cap
 from visfuse_cli.tracking.camera_watch import CameraWatch
 from visfuse_cli.tracking.elsewhere import HandOver
 from visfuse_cli.tracking.foreground import Detections, Detector, MovingRegions
@@ -58,6 +59,8 @@ class Clip:
 
 def follow(clip: Clip, run_: Run, spool: TrackSpool, findings: Findings, first_id: int, label: str | None) -> int:
     """Follow everything in one clip; returns the next free id."""
+    # One core belongs to the tracker: a pool as large as the machine would wait for it, spinning.
+    cv2.setNumThreads(thread_cap() or max(1, cv2.getNumberOfCPUs() - 1))
     findings.ledger.drawn[clip.name] = []
     strangers = findings.strangers[clip.name] = Strangers(clip.camera)
     with helper() as look_over, helper() as follow_corners:
