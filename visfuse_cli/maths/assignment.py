@@ -52,4 +52,6 @@ def assign(cost: Array, forbidden: float = np.inf) -> tuple[Indices, Indices, In
         barrier = (shifted.max() + 1.0) * (min(rows, columns) + 1)
         i, j = linear_sum_assignment(np.where(allowed, shifted, barrier))
         pairs = np.column_stack([i, j])[allowed[i, j]]
-    return pairs, np.setdiff1d(np.arange(rows), pairs[:, 0]), np.setdiff1d(np.arange(columns), pairs[:, 1])
+    free = np.ones(rows, dtype=bool), np.ones(columns, dtype=bool)
+    free[0][pairs[:, 0]] = free[1][pairs[:, 1]] = False
+    return pairs, np.flatnonzero(free[0]), np.flatnonzero(free[1])

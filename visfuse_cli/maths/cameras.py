@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from visfuse_cli.errors import InputError
 from visfuse_cli.records import Array, GroundCamera, GroundMap
@@ -106,18 +107,24 @@ def project(camera: GroundCamera, points: Array) -> tuple[Array, Array]:
     return pixels, jacobian
 
 
+def below_horizon(camera: GroundCamera, points: Array) -> NDArray[np.bool_]:
+    """Which image points (..., 2) show the ground."""
+    H = camera.ground.ground_from_image
+    return np.asarray((points @ H[2, :2] + H[2, 2]) * camera.ground.ground_sign > 0)
+
+
 def ground_scale(camera: GroundCamera, points: Array) -> Array:
     """Metres of ground (...) under a pixel in the worst direction at image points (..., 2); inf above the horizon."""
     H = camera.ground.ground_from_image
     homogeneous = points @ H[:, :2].T + H[:, 2]
-    w = homogeneous[..., 2:] * camera.ground.ground_sign
-    with np.errstate(divide="ignore", invalid="ignore"):
-        ground = homogeneous[..., :2] / homogeneous[..., 2:]
-        J = (H[:2, :2] - ground[..., None] * H[2, :2]) / homogeneous[..., 2:, None]
-        frobenius = np.sum(J * J, axis=(-2, -1))
-        determinant = J[..., 0, 0] * J[..., 1, 1] - J[..., 0, 1] * J[..., 1, 0]
-        largest = np.sqrt((frobenius + np.sqrt(np.clip(frobenius**2 - 4 * determinant**2, 0, None))) / 2)
-    return np.where(w[..., 0] > 0, largest, np.inf)
+    below = homogeneous[..., 2] * camera.ground.ground_sign > 0  # the horizon
+    w = np.where(below, homogeneous[..., 2], 1.0)[..., None]
+    ground = homogeneous[..., :2] / w
+    J = (H[:2, :2] - ground[..., None] * H[2, :2]) / w[..., None]
+    frobenius = np.sum(J * J, axis=(-2, -1))
+    determinant = J[..., 0, 0] * J[..., 1, 1] - J[..., 0, 1] * J[..., 1, 0]
+    largest = np.sqrt((frobenius + np.sqrt(np.maximum(frobenius**2 - 4 * determinant**2, 0))) / 2)
+    return np.where(below, largest, np.inf)
 
 
 def elevation(camera: GroundCamera, ground_points: Array, height: float) -> Array:

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from visfuse_cli.maths.cameras import ground_scale
+from visfuse_cli.maths.cameras import below_horizon
 from visfuse_cli.maths.homography import apply
 from visfuse_cli.records import Array, GroundCamera, Image
 from visfuse_cli.vision.lens import undistort_points
@@ -123,7 +123,7 @@ class MovingPoints:
     def _on_ground(self, pixels: Array) -> Array:
         """Ground places (n, 2) m behind pixels (n, 2), NaN above the horizon."""
         ground = apply(self._camera.ground.ground_from_image, pixels)
-        return np.where(np.isfinite(ground_scale(self._camera, pixels))[:, None], ground, np.nan)
+        return np.where(below_horizon(self._camera, pixels)[:, None], ground, np.nan)
 
     def _seek(self, small: Image, mask: Image) -> None:
         free = cv2.erode(mask, np.ones((3, 3), np.uint8))

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -117,8 +118,16 @@ def _terms(pose: Array, size: Array, c: Array, s: Array, out: Array) -> None:
 
 def _seen_terms(camera: GroundCamera) -> Array:
     """From the terms of a box to its corners in the image, homogeneous: (8, 24), u, v and depth of eight each."""
+    return _seen_through(camera.image_from_world.tobytes())
+
+
+@lru_cache(maxsize=8)
+def _seen_through(projection: bytes) -> Array:
     return np.asarray(
-        (camera.image_from_world @ _IN_TERMS.reshape(4, 64)).reshape(3, 8, 8).swapaxes(0, 1).reshape(8, 24)
+        (np.frombuffer(projection).reshape(3, 4) @ _IN_TERMS.reshape(4, 64))
+        .reshape(3, 8, 8)
+        .swapaxes(0, 1)
+        .reshape(8, 24)
     )
 
 
