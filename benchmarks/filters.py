@@ -119,12 +119,12 @@ def people(tracks: int) -> Step:
 def _interacting(tracks: int, F: np.ndarray, Q: np.ndarray) -> Step:
     models, size = F.shape[:2]
     bank, log_p = imm.start(beliefs(tracks, np.zeros(size)), models), imm.transition(models, 0.95)
-    H = np.eye(3, size)
+    H, z = np.eye(3, size), np.full(3, 0.1)
 
     def step() -> None:
         nonlocal bank
         ahead = imm.predict(bank, log_p, lambda x: (gaussian.times(F, x), F, Q))
-        after, _ = imm.update(ahead, 0.1 - ahead.predicted.mean[..., :3], H, R3)
+        after, _ = imm.update(ahead, z - ahead.predicted.mean[..., :3], H, R3)
         bank = after.filtered
         imm.combined(bank)
 

@@ -78,7 +78,7 @@ def update(belief: Gaussian, residual: Array, H: Array, R: Array) -> tuple[Gauss
     return Gaussian(belief.mean + moved[..., -1], symmetrise(M)), innovation
 
 
-def _weighed(P: Array, residual: Array, H: Array, R: Array) -> tuple[Innovation, Array, Array]:
+def _weighed(P: Array, residual: Array, H: Array, R: Array) -> tuple[Innovation, Array, NDArray[Any]]:
     """A measurement against a covariance: the innovation, P H^T (..., n, m), and [I; r^T] L^-T (..., m + 1, m).
 
     L is the Cholesky factor of S. S^-1 itself is never formed: as a factor it would cost a vague prior its digits.
@@ -89,16 +89,14 @@ def _weighed(P: Array, residual: Array, H: Array, R: Array) -> tuple[Innovation,
     if residual.shape != S.shape[:-1]:
         residual = np.broadcast_to(residual, np.broadcast_shapes(residual.shape, S.shape[:-1]))
     # One factorisation does it all: below the factor L of S, that of [[S, .], [B, c I]] holds B L^-T; B is [I; r^T].
-    joint = np.empty((*residual.shape[:-1], 2 * m + 1, 2 * m + 1))
-    joint[...] = _border(m)
+    border = _border(m)
+    joint = np.empty(residual.shape[:-1] + border.shape)
+    joint[...] = border
     joint[..., :m, :m] = S
     joint[..., -1, :m] = residual
     factor = np.linalg.cholesky(joint)
-    whitened = factor[..., -1, :m]
-    nis = (whitened * whitened).dot(_ones(m))
-    log_likelihood = nis * MINUS_HALF
-    log_likelihood -= _log_normaliser(factor[..., :m, :m])
-    return Innovation(residual, S, nis, log_likelihood), P_H, factor[..., m:, :m]
+    fit = _fit(factor[..., -1, :m], factor[..., :m, :m])
+    return Innovation(residual, S, *fit), P_H, factor[..., m:, :m]
 
 
 @cache
@@ -128,14 +126,16 @@ def mahalanobis(residual: Array, cov: Array) -> Array:
 
 def _density(residual: Array, cov: Array) -> tuple[Array, Array]:
     L = np.linalg.cholesky(cov)
-    whitened = np.linalg.solve(L, residual[..., None])[..., 0]
-    distance = np.sum(whitened**2, axis=-1)
-    return distance, -0.5 * distance - _log_normaliser(L)
+    return _fit(np.linalg.solve(L, residual[..., None])[..., 0], L)
 
 
-def _log_normaliser(L: NDArray[Any]) -> Array:
-    """log of sqrt(det(2 pi S)) (...) from the Cholesky factors (..., n, n) of S."""
-    return (np.log(L.diagonal(0, -2, -1)) + HALF_LOG_TAU).dot(_ones(L.shape[-1]))
+def _fit(whitened: NDArray[Any], L: NDArray[Any]) -> tuple[Array, Array]:
+    """Squared length of residuals (..., n) whitened by the Cholesky factors L (..., n, n), and log normal density."""
+    ones = _ones(L.shape[-1])
+    squared = (whitened * whitened).dot(ones)
+    log_density = squared * MINUS_HALF
+    log_density -= (np.log(L.diagonal(0, -2, -1)) + HALF_LOG_TAU).dot(ones)
+    return squared, log_density
 
 
 @cache
