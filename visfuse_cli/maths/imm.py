@@ -132,8 +132,7 @@ def mix(bank: Bank, log_p: Array, angles: tuple[int, ...] = ()) -> tuple[Gaussia
     shift = _shared(share, known.off)
     cov = _shared(share, known.second).reshape(*shift.shape, -1)
     cov -= shift[..., :, None] * shift[..., None, :]  # from about the common mean to about each one's own
-    mean = wrap_at(known.mean + shift, angles) if angles else _shared(share, bank.beliefs.mean)
-    return Gaussian(mean, cov), np.log(c)
+    return Gaussian(wrap_at(known.mean + shift, angles), cov), np.log(c)
 
 
 def _moments(beliefs: Gaussian, mu: Array, angles: tuple[int, ...]) -> Moments:
