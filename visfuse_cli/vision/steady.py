@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from visfuse_cli.maths.percentiles import median
 from visfuse_cli.records import Array, Image
 from visfuse_cli.vision.exposure import Exposure, levelled
 
@@ -175,8 +176,8 @@ def _turn(here: NDArray[np.float32], there: NDArray[np.float32], sharpness: Arra
     for _ in range(ROUNDS):
         step = np.linalg.solve((weight @ squares).reshape(3, 3), weight @ wanted)
         error = off - J @ step
-        size = np.sum((error[:, None] @ sharpness)[:, 0] * error, axis=1)
-        weight = 1 / (1 + size / max(float(np.median(size)), 1e-12))
+        size = ((error[:, None] @ sharpness)[:, 0] * error).sum(axis=1)
+        weight = 1 / (1 + size / max(median(size), 1e-12))
     R = np.array([[np.cos(step[2]), -np.sin(step[2])], [np.sin(step[2]), np.cos(step[2])]])
     return np.vstack([np.column_stack([R, step[:2] + middle - R @ middle]), [0, 0, 1]])
 
