@@ -80,29 +80,28 @@ class MovingRegions:
             background.model, background.threshold, background.shadow_ratio, background.memory_s
         )
         self._background.start(empty)
+        self._empty = empty  # the scene as it was learnt before the last frame: nobody waits for what is being learnt
         self._watched = None if region is None else region.picture(camera)
         self._sun, self._shade = Sun(camera), Shade(background.shadow_ratio)
-        self._found: Callable[[], Image] | None = None  # what is being looked at ahead
+        self._found: Callable[[], tuple[Image, Image]] | None = None  # labels and grey picture, made ahead
         self._learnt: Callable[[], None] = nothing  # what is being learnt
         self._raw = self._labels = np.zeros((0, 0), np.uint8)
 
     def foresee(self, frame: Frame) -> None:
-        self._found = self._hand_over(lambda: self._background.detect(frame.image))
+        self._found = self._hand_over(lambda: (self._background.detect(frame.image), grey_of(frame.image)))
 
     def evidence(self, frame: Frame, expected: Boxes) -> Evidence:
         if self._found is None:
             self.foresee(frame)
         assert self._found is not None
-        labels = self._raw = self._found()
-        self._found = None
+        labels, grey = self._found()
+        self._found, self._raw = None, labels
         if self._watched is not None:
             labels = np.asarray(cv2.bitwise_and(labels, self._watched), dtype=np.uint8)
         if self._sun.shadow is not None and self._shade.needed and len(expected[0]):
             where = shadow_picture(self._camera, *expected, self._sun.shadow.per_metre)
-            self._learnt()
-            labels = self._shade.cut(labels, frame.image, self._background.picture, where)
+            labels = self._shade.cut(labels, frame.image, self._empty, where)
         self._labels = labels
-        grey = np.asarray(cv2.cvtColor(frame.image, cv2.COLOR_BGR2GRAY), dtype=np.uint8)
         return LabelEvidence(labels, self._camera, self._bands, *self._cleaning, grey, self._hand_over)
 
     def learn(self, frame: Frame, tracker: GroundTracker) -> None:
@@ -111,6 +110,7 @@ class MovingRegions:
         self._sun.look(frame.t, self._labels, pose, size, settled, [track.id for track in tracker.tracks])
         followed, raw = self._outlines(pose, size), self._raw
         self._learnt()
+        self._empty = self._background.picture
         self._learnt = self._hand_over(lambda: self._background.learn(frame.image, frame.t, followed, raw))
 
     def _outlines(self, pose: Array, size: Array) -> Iterator[Array]:
@@ -122,6 +122,11 @@ class MovingRegions:
     def report(self) -> dict[str, Any] | None:
         self._learnt()
         return None if self._sun.shadow is None else self._sun.shadow.report()
+
+
+def grey_of(image: Image) -> Image:
+    """A picture (H, W, 3) in grey (H, W)."""
+    return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), dtype=np.uint8)
 
 
 class Detections:

@@ -105,6 +105,6 @@ class Background:
             moved = cv2.compare(cv2.bitwise_and(now, labels), FOREGROUND, cv2.CMP_EQ)
             gone = find_ghosts(grey, earlier, moved, cv2.cvtColor(self._picture, cv2.COLOR_BGR2GRAY))
             if gone.any():
-                cv2.copyTo(image, gone, self._picture)
+                self._picture = np.asarray(cv2.copyTo(image, gone, self._picture.copy()), np.uint8)  # somebody may look
                 self._corrected = gone if self._corrected is None else cv2.bitwise_or(self._corrected, gone)
         self._compared = t, grey, now
