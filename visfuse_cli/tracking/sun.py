@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from visfuse_cli.maths.cameras import project
+from visfuse_cli.maths.percentiles import median
 from visfuse_cli.records import Array, GroundCamera, Image
 from visfuse_cli.vision import contour
 from visfuse_cli.vision.background import FOREGROUND, SHADOW
@@ -146,11 +147,12 @@ class Shade:
     def __init__(self, ratio: float) -> None:
         self._ratio = ratio  # darkest that colour alone takes for shadow, as a share of the lit ground
         self._found: deque[float] = deque(maxlen=SAMPLES)
+        self._usual = 0.0  # the median of what was found
 
     @property
     def needed(self) -> bool:
         """Whether colour alone does not tell shadows, or nobody knows yet."""
-        return len(self._found) < KNOWN or float(np.median(self._found)) <= CLEAR * self._ratio
+        return len(self._found) < KNOWN or self._usual <= CLEAR * self._ratio
 
     def cut(self, labels: Image, image: Image, empty: Image, where: Image) -> Image:
         """Labels with the foreground that is as dark as shadows are made shadow `where` one falls."""
@@ -158,16 +160,17 @@ class Shade:
         if places is None:
             return labels
         u, v = places.reshape(-1, 2).T
-        seen, lit = image[v, u].astype(np.float32), empty[v, u].astype(np.float32)
-        share = seen.sum(axis=1) / np.maximum(lit.sum(axis=1), 1.0)
-        grey = np.abs(seen - share[:, None] * lit).max(axis=1) < COLOUR
+        place = v * labels.shape[1] + u
+        seen, lit = (picture.reshape(-1, 3)[place].T.astype(np.float32) for picture in (image, empty))
+        share = seen.sum(axis=0) / np.maximum(lit.sum(axis=0), 1.0)
+        grey = np.abs(seen - share * lit).max(axis=0) < COLOUR
         darker = grey & (share < DARKER)
         if np.count_nonzero(darker) >= LEAST_DARK_PX:
-            self._found.append(float(np.median(share[darker])))
+            self._found.append(median(share[darker]))
+            self._usual = median(np.array(self._found))
         if len(self._found) < KNOWN or not self.needed:
             return labels
-        usual = float(np.median(self._found))
-        shadow = darker & (np.abs(share - usual) < ALIKE * usual) & (labels[v, u] == FOREGROUND)
+        shadow = darker & (np.abs(share - self._usual) < ALIKE * self._usual) & (labels.ravel()[place] == FOREGROUND)
         cleaned = labels.copy()
-        cleaned[v[shadow], u[shadow]] = SHADOW
+        cleaned.ravel()[place[shadow]] = SHADOW
         return cleaned
