@@ -29,7 +29,7 @@ from visfuse_cli.vision.empty import empty_picture
 from visfuse_cli.vision.steady import at_rest
 
 WARMUP_PICTURES = 31
-TOGETHER = 1000  # frames of tracks that have ended wait for one another: settling them at once takes less time
+TOGETHER = 500  # frames of tracks that have ended wait for one another: settling them at once takes less time
 STEADIED_PX = 0.3  # what is left of a shake between two pictures, at most
 
 
