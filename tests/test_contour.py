@@ -123,3 +123,11 @@ def test_a_detection_is_given_to_the_box_it_lies_on(lift):
         np.testing.assert_allclose(found.pose[0, :2], POSE[:2], atol=0.1)
     assert evidence.leftovers(POSE[None], CAR[None]) == []
     assert evidence.leftovers(POSE[None] + [4.0, 9.0, 0.0], CAR[None]) == [box]
+
+
+def test_boxes_behind_the_camera_are_nobodys():
+    front, behind = np.array([0.0, 20, np.pi / 2]), np.append(3 * CAMERA.centre[:2] - [0, 60], np.pi / 2)
+    with np.errstate(all="raise"):
+        mask = contour.owners(CAMERA, np.stack([behind, front]), np.stack([CAR, CAR]))
+    assert np.isnan(wireframe.projected(CAMERA, behind[None], CAR[None])).any()
+    assert np.unique(mask).tolist() == [0, 2]

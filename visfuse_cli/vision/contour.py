@@ -48,6 +48,7 @@ def hulls_of(camera: GroundCamera, pixels: Array) -> list[np.ndarray]:
     """The hulls (k, 2) of N times n points (2, N, n) px as the footage shows them, rounded; empty where any is NaN."""
     points = pixels.transpose(1, 2, 0)
     known = np.asarray(np.isfinite(points).all(axis=(1, 2)))
+    points = np.where(known[:, None, None], points, 0.0)
     if camera.ground.lens is not None:
         points = distort_points(points.reshape(-1, 2), camera.ground.lens).reshape(points.shape)
     whole = np.round(np.minimum(np.maximum(points, -1e4), 1e4)).astype(np.int32)
