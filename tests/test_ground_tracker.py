@@ -129,16 +129,18 @@ def test_a_car_that_stands_hidden_for_seconds_is_the_same_when_it_drives_on():
     assert error(track, tracker, truth)[0][-20:].max() < 0.5
 
 
-def test_half_an_outline_is_believed_when_it_was_seen_for_long():
-    def seen(likeness, support, seconds):
+def test_half_an_outline_is_believed_when_it_was_seen_for_long_and_stands_apart():
+    def seen(support, apart, paint, seconds):
         t = np.arange(0, seconds, 1 / FPS)
-        return evidence(SimpleNamespace(likeness=likeness, support=support, t=t, measured=np.ones(len(t), bool)))
+        known = np.ones(len(t), bool)
+        return evidence(SimpleNamespace(support=support, apart=apart, paint=paint, t=t, measured=known))
 
     least = SpeedSettings().min_evidence
-    assert seen(0.98, 0.9, 1.0) > least
-    assert seen(0.85, 0.6, 1.5) < least
-    assert seen(0.9, 0.6, 12.0) > least
-    assert seen(0.6, 0.5, 12.0) < least
+    assert seen(0.9, 1.0, 0.9, 1.0) > least
+    assert seen(0.5, 0.95, 0.8, 1.5) < least
+    assert seen(0.5, 0.95, 0.8, 12.0) > least
+    assert seen(0.5, 0.95, 0.2, 12.0) < least
+    assert seen(0.7, 0.7, 0.6, 8.0) < least
 
 
 def test_what_never_moves_is_given_up_with_its_place():

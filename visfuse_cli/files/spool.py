@@ -32,7 +32,7 @@ class TrackSpool:
         self._partial = folder / TRACKS_PARTIAL
         with failing_as_output(self._partial):
             self._file = open(self._partial, "w+b")  # noqa: SIM115  closed by __exit__
-        self._index: dict[int, tuple[int, int]] = {}  # id -> offset, length
+        self._index: dict[int, list[tuple[int, int]]] = {}  # id -> offset, length of its pieces: summary, states
         self._end = 0
 
     def __enter__(self) -> TrackSpool:
@@ -60,13 +60,28 @@ class TrackSpool:
         identity = int(track["id"])
         if identity in self._index:
             raise ValueError(f"two tracks have the id {identity}")
+        self._index[identity] = [self._append([_head(track)]), self._append(_states(track))]
+
+    def amend(self, identity: int, **changes: Any) -> None:
+        """Change entries of the summary of a track that was added."""
+        head, states = self._index[identity]
+        known = json.loads(self._text(head) + b"}")
+        known["summary"] |= changes
+        self._index[identity] = [self._append([_head(known)]), states]
+
+    def _append(self, text: Iterable[bytes]) -> tuple[int, int]:
+        """Write at the end of the hidden file; offset and length of what was written."""
+        begin = self._end
         with failing_as_output(self._partial):
-            self._file.seek(self._end)
-            self._file.writelines(_pieces(track))
+            self._file.seek(begin)
+            self._file.writelines(text)
             self._file.flush()
-        end = self._file.tell()
-        self._index[identity] = (self._end, end - self._end)
-        self._end = end
+        self._end = self._file.tell()
+        return begin, self._end - begin
+
+    def _text(self, where: tuple[int, int]) -> bytes:
+        self._file.seek(where[0])
+        return self._file.read(where[1])
 
     def read(self, identity: int) -> dict[str, Any]:
         """One track as it was added, but for its covariances."""
@@ -75,12 +90,12 @@ class TrackSpool:
 
     def _copied(self, identity: int) -> Iterator[bytes]:
         """The text of one track, piece by piece."""
-        offset, left = self._index[identity]
-        self._file.seek(offset)
-        while left:
-            piece = self._file.read(min(left, PIECE))
-            left -= len(piece)
-            yield piece
+        for offset, left in self._index[identity]:
+            self._file.seek(offset)
+            while left:
+                piece = self._file.read(min(left, PIECE))
+                left -= len(piece)
+                yield piece
 
     def finish(self) -> None:
         """Write tracks.json from what was added so far, sorted by id."""
@@ -120,9 +135,14 @@ def without_covariance(entry: dict[str, Any]) -> dict[str, Any]:
     return entry
 
 
-def _pieces(track: Mapping[str, Any]) -> Iterator[bytes]:
-    """The JSON text of one track, state by state; `states` come last."""
-    yield _text({key: value for key, value in track.items() if key != "states"})[:-1] + b',"states":['
+def _head(track: Mapping[str, Any]) -> bytes:
+    """The beginning of the JSON text of one track, without its states, which come last, and without the end."""
+    return _text({key: value for key, value in track.items() if key != "states"})[:-1]
+
+
+def _states(track: Mapping[str, Any]) -> Iterator[bytes]:
+    """The rest of it, state by state."""
+    yield b',"states":['
     for number, state in enumerate(track.get("states", ())):
         yield (b"," if number else b"") + _text(state)
     yield b"]}"

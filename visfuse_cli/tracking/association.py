@@ -51,18 +51,23 @@ def footprint_overlap(pose: Array, size: Array, other_pose: Array, other_size: A
 
     pose (N, 3), size (N, 3), other_pose (M, 3), other_size (M, 3): two things cannot stand in one place.
     """
+    return shared_footprint(pose[:, None], size[:, None], other_pose, other_size)
+
+
+def shared_footprint(pose: Array, size: Array, other_pose: Array, other_size: Array) -> Array:
+    """`footprint_overlap` (...) of each box with the other in its place: poses and sizes (..., 3)."""
     ours = _covered(pose, size, other_pose, other_size)
-    theirs = _covered(other_pose, other_size, pose, size).T
+    theirs = _covered(other_pose, other_size, pose, size)
     return np.maximum(ours, theirs)
 
 
 def _covered(pose: Array, size: Array, other_pose: Array, other_size: Array) -> Array:
-    """Share (N, M) of points spread over the inner part of each footprint that lie in the other's."""
-    c, s = np.cos(pose[:, 2, None]), np.sin(pose[:, 2, None])
-    along, across = INNER[:, 0] * size[:, :1], INNER[:, 1] * size[:, 1:2]
-    points = pose[:, None, :2] + np.stack([c * along - s * across, s * along + c * across], axis=-1)  # (N, P, 2)
-    off = points[:, None] - other_pose[:, None, :2]  # (N, M, P, 2)
-    c, s = np.cos(other_pose[:, 2, None]), np.sin(other_pose[:, 2, None])
-    inside = np.abs(c * off[..., 0] + s * off[..., 1]) < other_size[:, :1] / 2
-    inside &= np.abs(-s * off[..., 0] + c * off[..., 1]) < other_size[:, 1:2] / 2
+    """Share (...) of points spread over the inner part of footprints that lie in others."""
+    c, s = np.cos(pose[..., 2, None]), np.sin(pose[..., 2, None])
+    along, across = INNER[:, 0] * size[..., :1], INNER[:, 1] * size[..., 1:2]
+    x = pose[..., :1] + c * along - s * across - other_pose[..., :1]  # (..., P)
+    y = pose[..., 1:2] + s * along + c * across - other_pose[..., 1:2]
+    c, s = np.cos(other_pose[..., 2, None]), np.sin(other_pose[..., 2, None])
+    inside = np.abs(c * x + s * y) < other_size[..., :1] / 2
+    inside &= np.abs(-s * x + c * y) < other_size[..., 1:2] / 2
     return np.asarray(inside.mean(axis=-1))

@@ -244,10 +244,10 @@ class Nursery:
         for old in earlier:
             before = part_before(old, self._dynamics, samples, pose, guess.size)
             if before is not None:
-                return self._track(old.id, before[0] + samples, np.concatenate([before[1], pose]))
-        return self._track(identity, samples, pose)
+                return self._track(old.id, before[0] + samples, np.concatenate([before[1], pose]), samples[0].frame)
+        return self._track(identity, samples, pose, samples[0].frame)
 
-    def _track(self, identity: int, samples: list[Sample], pose: Array) -> Track:
+    def _track(self, identity: int, samples: list[Sample], pose: Array, traced_from: int) -> Track:
         """A track from its samples so far, its poses (n, 3) in them being roughly known."""
         camera, settings = self._camera, self._settings
         used = np.array([sample.measured for sample in samples], dtype=bool)
@@ -257,7 +257,7 @@ class Nursery:
         first = velocity_at_start(samples, pose)
         steps = self._replay(samples, fit, pose, first, sized.size)
         last = samples[int(np.flatnonzero(used)[-1])].t
-        return Track(identity, sized.prior, sized.size, sized.size_sigma, samples, steps, last)
+        return Track(identity, sized.prior, sized.size, sized.size_sigma, samples, steps, last, traced_from=traced_from)
 
     def _course(self, candidate: Candidate) -> Array | None:
         """Velocity (2,) m/s of a region's foot, once it is known."""

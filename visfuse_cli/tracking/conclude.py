@@ -50,6 +50,8 @@ class Path:
     refused: int
     likeness: float  # mean share of the outline that was found, of what could be
     support: float  # the same, of all of it: what is hidden, out of the picture or amidst others counts
+    apart: float  # mean share of the outline that does not lie in the midst of paint
+    paint: float  # mean share of the area that was paint, neither shadow nor as the empty road is
     misfit_px: float
     ended_by: str
     ahead: Array  # (T, 2) m: where it was expected a latency later, from what was known then
@@ -107,8 +109,10 @@ def _path(track: Track, of: _Settled, camera: GroundCamera, settings: TrackerSet
         nis_dof=len(dynamics.H),
         noise=of.noise,
         refused=track.refused,
-        likeness=float(np.nanmean([s.border for s in samples if s.measured])),
+        likeness=_mean([s.border for s in samples if s.measured]),
         support=float(np.mean([s.outline.tangent or s.outline.valid.mean() for s in samples if s.measured])),
+        apart=_mean([s.apart for s in samples if s.measured]),
+        paint=_mean([s.paint for s in samples if s.measured]),
         misfit_px=of.misfit_px,
         ended_by=track.ended_by,
         ahead=_ahead(of.steps, dynamics, settings.latency, float(of.size[0])),
@@ -173,6 +177,12 @@ def _size_z(size: Array, class_name: str, settings: TrackerSettings) -> float:
     prior = next(c for c in settings.target.classes if c.name == class_name)
     mean, sigma = measure.prior_arrays(prior)
     return float(np.linalg.norm((size - mean) / sigma))
+
+
+def _mean(shares: list[float]) -> float:
+    """The mean of what could be seen; 1 where nothing could."""
+    known = np.array(shares)[np.isfinite(shares)]
+    return float(known.mean()) if len(known) else 1.0
 
 
 def _calibration(camera: GroundCamera, planar: Array) -> tuple[Array, Array]:

@@ -98,6 +98,10 @@ class GroundTracker:
         tracks, self.tracks, self._held = self._held + tracks, [], []
         return tracks, self._nursery.finish()
 
+    def since(self) -> int:
+        """The first frame that a track may hold which has not been given back yet."""
+        return min(self._recent[0][0], *(track.samples[0].frame for track in (*self.tracks, *self._held)))
+
     def outlines(self) -> list[Array]:
         """Outlines (k, 2) px of the followed targets, as last known."""
         return [wireframe.silhouette(self.camera, *box) for box in zip(*self.boxes(), strict=True)]
@@ -154,7 +158,7 @@ class GroundTracker:
                 track.likeness += (border[k] - track.likeness) * share
                 seen = look.border[k] * fit.agreed[k] * np.nan_to_num(look.clear[k], nan=1.0)
                 track.doubt += (1 - seen - track.doubt) * share
-            sample = Sample(frame, self._t, look.outlines[k], float(border[k]), False)
+            sample = Sample.of(frame, self._t, look, k, border, False)
             if there[k]:
                 z, R = self.dynamics.measured(*measure.measurement(fit, k, pose[k]))
                 tried = dynamics_tools.take(self.dynamics, self._expected[k], z, R)
@@ -197,20 +201,25 @@ class GroundTracker:
             return
         replaced = [track, *(part for part in parts if self._shares_place(part, guess))]
         before = partial(self._boxes_at, without=replaced)
-        lately = list(self._recent)[:: -max(1, len(self._recent) // COMPARED)]
-        if guess.gain < self._explained(replaced, before, lately[:1]):
+        if guess.gain < self._explained(replaced, before, [self._recent[-1]]):
             return
         velocity = self.dynamics.planar(track.steps[-1].posterior.mean)[0][2:]
         gone = sorted(replaced, key=lambda each: -len(each.samples))
         better = self._nursery.grown(guess, velocity, track.id, self._recent, before, gone, False)
         if better is None:
             return
+        lately = self._spread(better.traced_from)
         if self._explained([better], before, lately) < BETTER * self._explained(replaced, before, lately):
             return
         better.compared = track.compared
         self.tracks[self.tracks.index(track)] = better
         self.tracks = [each for each in self.tracks if not any(each is part for part in replaced)]
         self._held += [trimmed(each, f"part of track {better.id}") for each in gone if each.id != better.id]
+
+    def _spread(self, since: int) -> list[tuple[int, float, Evidence]]:
+        """Some of the frames since one of the last, evenly spread."""
+        frames = [each for each in self._recent if each[0] >= since]
+        return frames[:: -max(1, len(frames) // COMPARED)]
 
     def _explained(
         self, tracks: list[Track], others: Callable[[int], Boxes], lately: list[tuple[int, float, Evidence]]

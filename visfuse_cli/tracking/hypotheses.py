@@ -129,8 +129,7 @@ def gains(camera: GroundCamera, frames: Sequence[Evidence], pose: Array, size: A
 
 def _gain(look: Look, area: Array) -> Array:
     filled = look.paint - SHADOW_ONLY * (look.moved - look.paint) - UNMOVED * (1 - look.moved)
-    amidst = look.border / np.maximum(look.likeness, 1e-9)  # 1 less the share of the border that lies in paint
-    return area**LARGER * filled * look.likeness**SHARPER * amidst**CROSSING
+    return area**LARGER * filled * look.likeness**SHARPER * look.apart**CROSSING
 
 
 def seen(look: Look, beyond_doubt: bool) -> NDArray[np.bool_]:

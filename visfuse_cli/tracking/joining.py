@@ -44,7 +44,8 @@ def part_before(
         same &= np.abs(across) < ASIDE_M
         # whatever the earlier one did in the end, or was too late to do
         fits = count > 0 and float(np.hypot(*apart[0])) < CLOSE_M
-        if np.mean(same) < SAME and not fits:
+        lasted = good and count > len(samples)  # too long, and too well, to be forgotten for what stands there now
+        if not fits and (lasted or np.mean(same) < SAME):
             return None
     else:
         gap = begin.t - old.samples[-1].t

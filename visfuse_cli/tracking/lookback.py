@@ -94,7 +94,7 @@ class _Way:
             if self._last_seen - t > LOST_S:
                 return False
             seen = self._take(t, measure.measurement(fit, k, pose[k]) if there[k] else None)
-            self._samples.append(Sample(frame, t, look.outlines[k], float(border[k]), seen))
+            self._samples.append(Sample.of(frame, t, look, k, border, seen))
             mean = self._step.posterior.mean
             self._poses.append(np.array([mean[0], mean[1], self._dynamics.heading(mean) - np.pi]))
             if len(self._samples) == PROOF and sum(sample.measured for sample in self._samples) < PROVEN * PROOF:

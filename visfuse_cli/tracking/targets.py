@@ -9,18 +9,29 @@ import numpy as np
 from visfuse_cli.records import Array
 from visfuse_cli.tracking.dynamics import Step
 from visfuse_cli.tracking.settings import SizePrior
+from visfuse_cli.vision.contour import Look
 from visfuse_cli.vision.wireframe import Outlines
 
 
 @dataclass(slots=True)
 class Sample:
-    """One frame of a target: its outline, the share of its border that was found (NaN: hidden)."""
+    """One frame of a target: its outline, and shares of what nothing hides (NaN: all is hidden).
+
+    border: of the border that could be found, what was; apart and paint as in `Look`.
+    """
 
     frame: int
     t: float
     outline: Outlines
     border: float
     measured: bool
+    apart: float = 1.0
+    paint: float = 1.0
+
+    @classmethod
+    def of(cls, frame: int, t: float, look: Look, k: int, border: Array, measured: bool) -> Sample:
+        """The k-th of the boxes that were looked for, border (N,) of each found."""
+        return cls(frame, t, look.outlines[k], float(border[k]), measured, float(look.apart[k]), float(look.paint[k]))
 
 
 @dataclass(slots=True)
@@ -49,6 +60,7 @@ class Track:
     refused: int = 0  # measurements that fell outside the gate
     refused_since: float | None = None  # s: since when all of them did
     ended_by: str = ""
+    traced_from: int = 0  # the frame back to which it was followed when it was found
 
 
 @dataclass(frozen=True, slots=True)

@@ -20,7 +20,7 @@ TURN_M = 0.25  # m a radian: the middle of a fitted box shifts as the vehicle sh
 SIZE_DOUBT = 0.03  # of a size: no vehicle is quite a box
 GOOD_ENOUGH, LONGER_FOR = 0.01, 1.5  # standard deviation of a speed over itself
 DOUBTFUL_ENDS, SHORT_S = ("jumped", "no longer looks like itself"), 1.0  # s: a track that does so sooner is nothing
-LASTING, SHORT_LOOK_S = 0.22, 2.0  # of a logistic fit to rendered traffic, true tracks against false ones
+APART, SOLID, LASTING, SHORT_LOOK_S = 2.0, 0.7, 0.22, 2.0  # a logistic fit to traffic, true tracks against false ones
 UNSEEN_S = 1.5  # s: a stretch goes over no longer gap
 JUMP_S = 0.3  # s a change of speed is looked at
 
@@ -34,10 +34,11 @@ class SpeedSettings(Section):
     max_sigma: float = Field(0.15, gt=0, le=10, description="standard deviation over speed: above, too uncertain")
     max_acceleration: float = Field(9.0, gt=0, le=100, description="m/s^2: above, the track has jumped")
     min_evidence: float = Field(
-        1.53,
+        3.0,
         ge=0,
-        le=3,
-        description="share of its outline that was found, of what could be seen plus of all of it, plus 0.22 times the "
+        le=5,
+        description="share of its outline that was found, plus 2 times the share that does not lie in the midst of "
+        "others, plus 0.7 times the share of its area that is no shadow and not as the empty road, plus 0.22 times the "
         "logarithm of the time it was seen over 2 s",
     )
     min_measured: float = Field(0.6, ge=0, le=1, description="share of a track's frames that must be measured")
@@ -162,8 +163,10 @@ def _reason(path: Path, verdict: Verdict, settings: SpeedSettings, trusted: bool
         length, width, height = path.size
         return f"no {path.class_name} measures {length:.1f} x {width:.1f} x {height:.1f} m: a part, or several"
     if evidence(path) < settings.min_evidence:
-        of, seen = f"a {path.class_name}'s outline", f"{100 * path.likeness:.0f} % of what could be seen"
-        return f"too little seen: {seen} of {of} and {100 * path.support:.0f} % of all of it"
+        found, free, filled = (f"{100 * share:.0f} %" for share in (path.support, path.apart, path.paint))
+        return (
+            f"too little seen: {found} of a {path.class_name}'s outline ({free} free of others), {filled} of its area"
+        )
     outline = _outline_px(path)
     if np.isfinite(path.misfit_px) and path.misfit_px > settings.max_misfit * outline + 3:
         return f"no box fits: outline off by {path.misfit_px:.0f} px (several vehicles, a shadow or a reflection)"
@@ -174,9 +177,10 @@ def _reason(path: Path, verdict: Verdict, settings: SpeedSettings, trusted: bool
 
 
 def evidence(path: Path) -> float:
-    """How much was seen of a track's outline: half of it for long is worth as much as most of it for short."""
+    """How much speaks for a track: its outline, apart from others, filled, and the time for which it was seen."""
     seen = path.measured.mean() * (path.t[-1] - path.t[0])
-    return float(path.likeness + path.support + LASTING * np.log(max(seen, SHORT_LOOK_S) / SHORT_LOOK_S))
+    shown = path.support + APART * path.apart + SOLID * path.paint
+    return float(shown + LASTING * np.log(max(seen, SHORT_LOOK_S) / SHORT_LOOK_S))
 
 
 def _jumps(path: Path) -> Array:

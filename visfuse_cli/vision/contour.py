@@ -74,6 +74,11 @@ class Look:
     paint: Array
     open: Array
 
+    @property
+    def apart(self) -> Array:
+        """Share (N,) of the border that does not lie in the midst of paint."""
+        return self.border / np.maximum(self.likeness, 1e-9)
+
     def __getitem__(self, which: object) -> Look:
         return Look(*(getattr(self, name)[which] for name in self.__dataclass_fields__))
 

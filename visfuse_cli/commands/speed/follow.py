@@ -154,7 +154,12 @@ class _Settling:
             self.run.count("regions that never became a track")
         self.waiting += tracks
         if self.waiting and (last or sum(len(track.samples) for track in self.waiting) >= TOGETHER):
-            for record in self.ledger.take(self.waiting, self.of, self.tracker.dynamics, self.lamps.only_light):
-                self.spool.add(record)
-                self.run.count("rejected" if record["summary"]["rejected"] else "vehicles")
+            for taken in self.ledger.take(self.waiting, self.of, self.tracker.dynamics, self.lamps.only_light):
+                self.spool.add(taken.record)
+                self.run.count("rejected" if taken.record["summary"]["rejected"] else "vehicles")
+                for identity in taken.displaced:
+                    self.spool.amend(identity, rejected=taken.reason)
+                    self.run.count("rejected")
+                    self.run.count("vehicles", -1)
             self.waiting = []
+            self.ledger.forget(self.of, self.tracker.since())
