@@ -100,7 +100,7 @@ class GroundTracker:
 
     def since(self) -> int:
         """The first frame that a track may hold which has not been given back yet."""
-        return min(self._recent[0][0], *(track.samples[0].frame for track in (*self.tracks, *self._held)))
+        return min([self._recent[0][0], *(track.samples[0].frame for track in (*self.tracks, *self._held))])
 
     def outlines(self) -> list[Array]:
         """Outlines (k, 2) px of the followed targets, as last known."""
