@@ -24,7 +24,7 @@ from visfuse_cli.tracking.elsewhere import HandOver, at_once
 from visfuse_cli.tracking.endings import ONE_PLACE, trimmed
 from visfuse_cli.tracking.evidence import Boxes, Evidence
 from visfuse_cli.tracking.hypotheses import LEAST_OPEN, Guess, gains
-from visfuse_cli.tracking.joining import WAIT_S
+from visfuse_cli.tracking.joining import WAIT_S, lasting
 from visfuse_cli.tracking.lookback import Recent
 from visfuse_cli.tracking.settings import TrackerSettings
 from visfuse_cli.tracking.targets import Abandoned, Comparison, Sample, Track
@@ -207,6 +207,8 @@ class GroundTracker:
         gone = sorted(replaced, key=lambda each: -len(each.samples))
         better = self._nursery.grown(guess, velocity, track.id, self._recent, before, gone, False)
         if better is None:
+            return
+        if lasting(track, better.samples[0].frame, len(better.samples)):  # what it was before would be lost
             return
         lately = self._spread(better.traced_from)
         if self._explained([better], before, lately) < BETTER * self._explained(replaced, before, lately):

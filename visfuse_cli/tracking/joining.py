@@ -30,8 +30,6 @@ def part_before(
     begin = samples[0]
     count = sum(sample.frame < begin.frame for sample in old.samples)
     kept = old.samples[:count]
-    believed = [sample.border for sample in kept if sample.measured]
-    good = len(believed) > 0 and float(np.nanmean(believed)) >= BELIEVED
     if count < len(old.samples):
         index = {sample.frame: k for k, sample in enumerate(samples)}
         common = [(k, index[s.frame]) for k, s in enumerate(old.samples) if s.frame in index]
@@ -44,8 +42,11 @@ def part_before(
         same &= np.abs(across) < ASIDE_M
         # whatever the earlier one did in the end, or was too late to do
         fits = count > 0 and float(np.hypot(*apart[0])) < CLOSE_M
-        lasted = good and count > len(samples)  # too long, and too well, to be forgotten for what stands there now
-        if not fits and (lasted or np.mean(same) < SAME):
+        if not fits and lasting(old, begin.frame, len(samples)):
+            fits = bool(same[0]) and _alike(size, old.size)
+            if not fits:
+                return None
+        if np.mean(same) < SAME and not fits:
             return None
     else:
         gap = begin.t - old.samples[-1].t
@@ -58,8 +59,22 @@ def part_before(
         turn = abs(wrap(pose[0, 2] - np.arctan2(way[1], way[0])))
         reach = CLOSE_M + DRIFT * gap * speed
         near = -reach < on < reach + slow * STARTS * gap**2 / 2 and abs(off) < ASIDE_M and turn < TURNED
-        alike = abs(np.log(size[0] / old.size[0])) < ALIKE
-        fits = bool(near and (gap < WAIT_S[0] or (slow and alike and gap < WAIT_S[1])))
+        fits = bool(near and (gap < WAIT_S[0] or (slow and _alike(size, old.size) and gap < WAIT_S[1])))
         if not fits:
             return None
-    return (kept, place[:count]) if fits and good else ([], np.zeros((0, 3)))
+    return (kept, place[:count]) if fits and _good(kept) else ([], np.zeros((0, 3)))
+
+
+def lasting(old: Track, begin: int, frames: int) -> bool:
+    """Whether a track was seen so well before a frame, and for more `frames`, that it is not to be forgotten."""
+    kept = [sample for sample in old.samples if sample.frame < begin]
+    return len(kept) > frames and _good(kept)
+
+
+def _good(samples: list[Sample]) -> bool:
+    believed = [sample.border for sample in samples if sample.measured]
+    return len(believed) > 0 and float(np.nanmean(believed)) >= BELIEVED
+
+
+def _alike(size: Array, other: Array) -> bool:
+    return bool(abs(np.log(size[0] / other[0])) < ALIKE)

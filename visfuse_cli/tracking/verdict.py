@@ -23,6 +23,8 @@ DOUBTFUL_ENDS, SHORT_S = ("jumped", "no longer looks like itself"), 1.0  # s: a 
 APART, SOLID, LASTING, SHORT_LOOK_S = 2.0, 0.7, 0.22, 2.0  # a logistic fit to traffic, true tracks against false ones
 UNSEEN_S = 1.5  # s: a stretch goes over no longer gap
 JUMP_S = 0.3  # s a change of speed is looked at
+SUDDEN = 1.5  # times as much as it is counts what a vehicle gains: it cannot as fast as it brakes
+WANDER_PX, WANDER_S = 0.3, 2.0  # px by which outlines lie off, and s for which they do: noise that frames share
 
 
 class SpeedSettings(Section):
@@ -114,13 +116,15 @@ def _best_stretch(
     calibration = np.einsum("sh,hk,sk->s", g, entry_cov, g)
     slip = np.einsum("td,tdp->tp", tangent, path.pixel)  # m along the way for a pixel
     bias = bias_px**2 * np.sum((slip[j] - slip[i]) ** 2, axis=1)
+    alike = np.exp(-duration / WANDER_S)[:, None] * slip[i] * slip[j]
+    wander = WANDER_PX**2 * np.sum(slip[i] ** 2 + slip[j] ** 2 - 2 * alike, axis=1)
     stretch = np.einsum("td,tdp->tp", tangent, path.size_pull)  # m along the way for a metre of size
     doubt_of_size = np.hypot(path.size_sigma, SIZE_DOUBT * path.size)
     size = np.sum((doubt_of_size * (stretch[j] - stretch[i])) ** 2, axis=1)
     angle = np.unwrap(np.arctan2(tangent[:, 1], tangent[:, 0]))
     turned = (TURN_M * (angle[j] - angle[i])) ** 2
     stamps = 2 * (distance / np.maximum(duration, 1e-9) * settings.sigma_t_s) ** 2
-    sigma_way = np.sqrt(pose + np.clip(calibration, 0, None) + bias + size + turned + stamps)
+    sigma_way = np.sqrt(pose + np.clip(calibration, 0, None) + bias + wander + size + turned + stamps)
     doubt = sigma_way / np.maximum(distance, 1e-3)
     good = doubt <= max(LONGER_FOR * float(doubt.min()), GOOD_ENOUGH)
     best = int(np.argmax(np.where(good, distance, -np.inf)))
@@ -191,7 +195,8 @@ def _jumps(path: Path) -> Array:
     excess = np.zeros(len(t))
     reach = max(1, round(JUMP_S / float(np.median(np.diff(t))))) if len(t) > 2 else len(t)
     if reach < len(t):
-        change = np.abs(speed[reach:] - speed[:-reach])
+        gained = speed[reach:] - speed[:-reach]
+        change = np.abs(gained) * np.where(gained > 0, SUDDEN, 1.0)
         change = np.maximum(change - 2 * (sigma[reach:] + sigma[:-reach]), change / 2)  # no doubt explains everything
         excess[reach // 2 : len(t) - reach + reach // 2] = change / (t[reach:] - t[:-reach])
     return np.asarray(maximum_filter1d(excess, 3 * reach + 1))  # smoothing bends the path around a jump as well
