@@ -137,10 +137,10 @@ def test_half_an_outline_is_believed_when_it_was_seen_for_long_and_stands_apart(
 
     least = SpeedSettings().min_evidence
     assert seen(0.9, 1.0, 0.9, 1.0) > least
-    assert seen(0.5, 0.95, 0.8, 1.5) < least
-    assert seen(0.5, 0.95, 0.8, 12.0) > least
-    assert seen(0.5, 0.95, 0.2, 12.0) < least
-    assert seen(0.7, 0.7, 0.6, 8.0) < least
+    assert seen(0.5, 0.92, 0.7, 1.5) < least
+    assert seen(0.5, 0.92, 0.7, 12.0) > least
+    assert seen(0.5, 0.92, 0.2, 12.0) < least
+    assert seen(0.7, 0.7, 0.9, 8.0) < least
 
 
 def test_what_never_moves_is_given_up_with_its_place():
