@@ -197,7 +197,8 @@ def test_silhouettes_of_the_live_tracks_are_their_outlines():
     for k, pose in enumerate(truth):
         tracker.predict(k / FPS)
         tracker.update(k, evidence_of(CAMERA, labels_of(CAMERA, [(pose, CAR)])))
-    (outline,) = tracker.outlines()
+    ((pose,), (size,)) = tracker.boxes()
+    outline = wireframe.silhouette(CAMERA, pose, size)
     true = wireframe.silhouette(CAMERA, truth[-1], CAR)
     np.testing.assert_allclose(outline.min(axis=0), true.min(axis=0), atol=8)
     np.testing.assert_allclose(outline.max(axis=0), true.max(axis=0), atol=8)

@@ -64,9 +64,8 @@ class Nursery:
         """Begin to follow the corners of what moves; people turn and bend, so that theirs tell little."""
         steers = self._settings.target.motion == "bicycle"
         if steers and isinstance(evidence, LabelEvidence) and (picture := evidence.picture()) is not None:
-            paint = evidence.paint()
             self._watched()
-            self._watched = self._hand_over(lambda: self._points.follow(picture, t, paint))
+            self._watched = self._hand_over(lambda: self._points.follow(picture, t, evidence.paint()))
 
     def moves(self) -> Moves:
         """How the corners of what moves went to the present frame."""

@@ -102,10 +102,6 @@ class GroundTracker:
         """The first frame that a track may hold which has not been given back yet."""
         return min([self._recent[0][0], *(track.samples[0].frame for track in (*self.tracks, *self._held))])
 
-    def outlines(self) -> list[Array]:
-        """Outlines (k, 2) px of the followed targets, as last known."""
-        return [wireframe.silhouette(self.camera, *box) for box in zip(*self.boxes(), strict=True)]
-
     def headings(self) -> list[float]:
         """Headings (rad) of the followed targets, as last known."""
         return [float(self.dynamics.heading(track.steps[-1].posterior.mean)) for track in self.tracks]

@@ -40,7 +40,7 @@ class Comparison:
 
     due: float = -np.inf
     place: Array = field(default_factory=lambda: np.full(2, np.inf))
-    wait: float = 0.5
+    wait: float = 1.0
 
 
 @dataclass(slots=True)

@@ -20,7 +20,7 @@ TURN_M = 0.25  # m a radian: the middle of a fitted box shifts as the vehicle sh
 SIZE_DOUBT = 0.03  # of a size: no vehicle is quite a box
 GOOD_ENOUGH, LONGER_FOR = 0.01, 1.5  # standard deviation of a speed over itself
 DOUBTFUL_ENDS, SHORT_S = ("jumped", "no longer looks like itself"), 1.0  # s: a track that does so sooner is nothing
-APART, SOLID, LASTING, SHORT_LOOK_S = 3.0, 1.2, 0.18, 2.0  # a logistic fit to traffic, true tracks against false ones
+APART, SOLID, LASTING, SHORT_LOOK_S = 2.5, 0.9, 0.18, 2.0  # a logistic fit to traffic, true tracks against false ones
 UNSEEN_S = 1.5  # s: a stretch goes over no longer gap
 JUMP_S = 0.3  # s a change of speed is looked at
 SUDDEN = 1.5  # times as much as it is counts what a vehicle gains: it cannot as fast as it brakes
@@ -36,11 +36,11 @@ class SpeedSettings(Section):
     max_sigma: float = Field(0.15, gt=0, le=10, description="standard deviation over speed: above, too uncertain")
     max_acceleration: float = Field(9.0, gt=0, le=100, description="m/s^2: above, the track has jumped")
     min_evidence: float = Field(
-        4.2,
+        3.55,
         ge=0,
-        le=7,
-        description="share of its outline that was found, plus 3 times the share that does not lie in the midst of "
-        "others, plus 1.2 times the share of its area that is neither shadow nor empty road, plus 0.18 times the "
+        le=6,
+        description="share of its outline that was found, plus 2.5 times the share that does not lie in the midst of "
+        "others, plus 0.9 times the share of its area that is neither shadow nor empty road, plus 0.18 times the "
         "logarithm of the time it was seen over 2 s",
     )
     min_measured: float = Field(0.6, ge=0, le=1, description="share of a track's frames that must be measured")
