@@ -236,11 +236,11 @@ def residual(dynamics: Dynamics, z: Array, x: Array) -> Array:
 
 
 def take(dynamics: Dynamics, prediction: Prediction, z: Array, R: Array) -> Step:
-    """Take in one target's measurement (Lou 2002, eqs. 5-11; Jia 2008, eqs. 27-31 where models interact)."""
+    """Take in a measurement z (..., m) of noise R (..., m, m) (Lou 2002, eqs. 5-11; Jia 2008, eqs. 27-31: models)."""
     gamma = residual(dynamics, z, prediction.prior.mean)
     if prediction.models is not None:
-        each = residual(dynamics, z, prediction.models.predicted.mean)
-        models, _ = imm.update(prediction.models, each, dynamics.H, R)
+        each = residual(dynamics, z[..., None, :], prediction.models.predicted.mean)
+        models, _ = imm.update(prediction.models, each, dynamics.H, R[..., None, :, :])
         innovation = gaussian.innovate(prediction.prior, gamma, dynamics.H, R)
         posterior = imm.combined(models.filtered, dynamics.angles_x)
         return Step(prediction.prior, posterior, prediction.F, innovation, None, models)
