@@ -13,7 +13,7 @@ from visfuse_cli.tracking.conclude import conclude
 from visfuse_cli.tracking.ground import GroundTracker
 from visfuse_cli.tracking.settings import TrackerSettings
 from visfuse_cli.tracking.verdict import SpeedSettings, judge
-from visfuse_cli.tracking.zones import Region, trusted
+from visfuse_cli.tracking.zones import Region, stretch, trusted
 
 CAMERA = road_camera()
 ELL = np.array([[0.0, 0], [4, 0], [4, 1], [1, 1], [1, 3], [0, 3]])
@@ -123,6 +123,16 @@ def test_a_track_outside_the_trusted_zone_is_rejected_with_that_reason(passing):
         for zone in (True, False)
     ]
     assert verdicts == ["", "outside the trusted zone"]
+
+
+@pytest.mark.parametrize("frames", [slice(10, 40), slice(10, 11)], ids=["a stretch", "one frame"])
+def test_what_was_hidden_all_the_way_through_a_region_is_rejected_with_that_reason(passing, frames):
+    _, settings, tracker, (track,) = passing
+    (path,) = conclude([track], CAMERA, settings, tracker.dynamics)
+    part = stretch(replace(path, measured=np.zeros(len(path.t), dtype=bool)), frames)
+    verdict = judge(part, CAMERA.ground.cov, 1.0, SpeedSettings(min_measured=0), np.ones(len(part.t), dtype=bool))
+    assert verdict.reason == "never seen: all of it is predicted"
+    assert np.isfinite([verdict.speed, verdict.sigma, verdict.distance, verdict.course]).all()
 
 
 def test_positions_ahead_are_where_the_car_is_then():

@@ -65,7 +65,7 @@ class TrackSpool:
     def amend(self, identity: int, **changes: Any) -> None:
         """Change entries of the summary of a track that was added."""
         head, states = self._index[identity]
-        known = json.loads(self._text(head) + b"}")
+        known = json.loads(self._stored(head) + b"}")
         known["summary"] |= changes
         self._index[identity] = [self._append([_head(known)]), states]
 
@@ -79,7 +79,7 @@ class TrackSpool:
         self._end = self._file.tell()
         return begin, self._end - begin
 
-    def _text(self, where: tuple[int, int]) -> bytes:
+    def _stored(self, where: tuple[int, int]) -> bytes:
         self._file.seek(where[0])
         return self._file.read(where[1])
 

@@ -15,7 +15,7 @@ SHARED = 0.15  # of a footprint, in another's: more than boxes err by
 OFTEN, LASTING, LEAST_FRAMES = 1 / 3, 0.15, 5  # of the common frames, of the shorter one's frames, and at least
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)  # one is itself: arrays are not compared
 class Stand:
     """Where a track stood: frames (T,) in which it was measured, pose (T, 3), size (3,), how much speaks for it."""
 

@@ -92,7 +92,7 @@ def _best_stretch(
     path: Path, length: Array, tangent: Array, entry_cov: Array, bias_px: float, settings: SpeedSettings
 ) -> tuple[int, int, float]:
     """First and last state, and the deviation of the mean speed between them (m/s)."""
-    seen = np.flatnonzero(path.measured)
+    seen = np.flatnonzero(path.measured) if path.measured.any() else np.arange(len(path.t))
     grid = np.unique(seen[np.linspace(0, len(seen) - 1, min(len(seen), 48)).astype(int)])
     i, j = (index.ravel() for index in np.meshgrid(grid, grid, indexing="ij"))
     duration, distance = path.t[j] - path.t[i], length[j] - length[i]
@@ -149,6 +149,8 @@ def _reason(path: Path, verdict: Verdict, settings: SpeedSettings, trusted: bool
     refused = path.refused / max(1, path.refused + int(path.measured.sum()))
     if path.ended_by.startswith(("same vehicle", "part of")):
         return path.ended_by
+    if not path.measured.any():  # hidden all the way through a region, say
+        return "never seen: all of it is predicted"
     if not trusted:
         return "outside the trusted zone"
     if frames < settings.min_frames or duration < settings.min_duration_s:
