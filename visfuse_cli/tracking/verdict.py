@@ -147,7 +147,7 @@ def _reason(path: Path, verdict: Verdict, settings: SpeedSettings, trusted: bool
     frames = int(path.measured[verdict.first : verdict.last + 1].sum())
     excess = float(np.max(_jumps(path)[verdict.first : verdict.last + 1], initial=0.0))
     refused = path.refused / max(1, path.refused + int(path.measured.sum()))
-    if path.ended_by.startswith(("same vehicle", "part of")):
+    if path.ended_by.startswith("part of"):
         return path.ended_by
     if not path.measured.any():  # hidden all the way through a region, say
         return "never seen: all of it is predicted"
