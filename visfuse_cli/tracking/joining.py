@@ -27,42 +27,49 @@ def part_before(
     the same vehicle wrongly, None when it followed another."""
     was = np.stack([step.posterior.mean for step in old.steps])
     place = np.column_stack([was[:, :2], dynamics.heading(was)])
-    begin = samples[0]
-    count = sum(sample.frame < begin.frame for sample in old.samples)
-    kept = old.samples[:count]
-    if count < len(old.samples):
-        index = {sample.frame: k for k, sample in enumerate(samples)}
-        common = [(k, index[s.frame]) for k, s in enumerate(old.samples) if s.frame in index]
-        mine, its = np.array(common).T
-        apart = place[mine, :2] - pose[its, :2]
-        ahead = np.column_stack([np.cos(pose[its, 2]), np.sin(pose[its, 2])])
-        along, across = np.sum(apart * ahead, axis=1), ahead[:, 0] * apart[:, 1] - ahead[:, 1] * apart[:, 0]
-        turned = np.abs(wrap(place[mine, 2] - pose[its, 2]))
-        same = (np.abs(along) < max(CLOSE_M, PART * (size[0] + old.size[0]))) & (turned < TURNED)
-        same &= np.abs(across) < ASIDE_M
-        # whatever the earlier one did in the end, or was too late to do
-        fits = count > 0 and float(np.hypot(*apart[0])) < CLOSE_M
-        if not fits and lasting(old, begin.frame, len(samples)):
-            fits = bool(same[0]) and _alike(size, old.size)
-            if not fits:
-                return None
-        if np.mean(same) < SAME and not fits:
-            return None
+    kept = [sample for sample in old.samples if sample.frame < samples[0].frame]
+    if len(kept) < len(old.samples):
+        fits, one = _while_both(old, place, samples, pose, size)
     else:
-        gap = begin.t - old.samples[-1].t
         planar, _ = dynamics.planar(was[-1])
-        speed = max(float(np.hypot(*planar[2:])), 1e-6)
-        slow = speed < SLOW  # what hardly moves goes where it faces
-        way = np.array([np.cos(place[-1, 2]), np.sin(place[-1, 2])]) if slow else planar[2:] / speed
-        offset = pose[0, :2] - planar[:2] - gap * planar[2:]
-        on, off = float(offset @ way), float(way[0] * offset[1] - way[1] * offset[0])
-        turn = abs(wrap(pose[0, 2] - np.arctan2(way[1], way[0])))
-        reach = CLOSE_M + DRIFT * gap * speed
-        near = -reach < on < reach + slow * STARTS * gap**2 / 2 and abs(off) < ASIDE_M and turn < TURNED
-        fits = bool(near and (gap < WAIT_S[0] or (slow and _alike(size, old.size) and gap < WAIT_S[1])))
-        if not fits:
-            return None
-    return (kept, place[:count]) if fits and _good(kept) else ([], np.zeros((0, 3)))
+        fits = one = _drives_on(old, planar, place[-1, 2], samples[0].t, pose[0], size)
+    if not one:
+        return None
+    return (kept, place[: len(kept)]) if fits and _good(kept) else ([], np.zeros((0, 3)))
+
+
+def _while_both(old: Track, place: Array, samples: list[Sample], pose: Array, size: Array) -> tuple[bool, bool]:
+    """Whether an earlier track at places (k, 3) may be gone on from in a new one that it has frames in common with, and
+    whether the two followed one vehicle."""
+    index = {sample.frame: k for k, sample in enumerate(samples)}
+    common = [(k, index[s.frame]) for k, s in enumerate(old.samples) if s.frame in index]
+    mine, its = np.array(common).T
+    apart = place[mine, :2] - pose[its, :2]
+    ahead = np.column_stack([np.cos(pose[its, 2]), np.sin(pose[its, 2])])
+    along, across = np.sum(apart * ahead, axis=1), ahead[:, 0] * apart[:, 1] - ahead[:, 1] * apart[:, 0]
+    turned = np.abs(wrap(place[mine, 2] - pose[its, 2]))
+    same = (np.abs(along) < max(CLOSE_M, PART * (size[0] + old.size[0]))) & (turned < TURNED)
+    same &= np.abs(across) < ASIDE_M
+    # whatever the earlier one did in the end, or was too late to do
+    fits = old.samples[0].frame < samples[0].frame and float(np.hypot(*apart[0])) < CLOSE_M
+    if not fits and lasting(old, samples[0].frame, len(samples)):
+        fits = bool(same[0]) and _alike(size, old.size)
+        return fits, fits
+    return fits, bool(fits or np.mean(same) >= SAME)
+
+
+def _drives_on(old: Track, planar: Array, heading: float, t: float, pose: Array, size: Array) -> bool:
+    """Whether what was last seen with a planar state (4,) and a heading may stand at a pose (3,) at a later t (s)."""
+    gap = t - old.samples[-1].t
+    speed = max(float(np.hypot(*planar[2:])), 1e-6)
+    slow = speed < SLOW  # what hardly moves goes where it faces
+    way = np.array([np.cos(heading), np.sin(heading)]) if slow else planar[2:] / speed
+    offset = pose[:2] - planar[:2] - gap * planar[2:]
+    on, off = float(offset @ way), float(way[0] * offset[1] - way[1] * offset[0])
+    turn = abs(wrap(pose[2] - np.arctan2(way[1], way[0])))
+    reach = CLOSE_M + DRIFT * gap * speed
+    near = -reach < on < reach + slow * STARTS * gap**2 / 2 and abs(off) < ASIDE_M and turn < TURNED
+    return bool(near and (gap < WAIT_S[0] or (slow and _alike(size, old.size) and gap < WAIT_S[1])))
 
 
 def lasting(old: Track, begin: int, frames: int) -> bool:
