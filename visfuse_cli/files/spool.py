@@ -84,7 +84,7 @@ class TrackSpool:
         return self._file.read(where[1])
 
     def read(self, identity: int) -> dict[str, Any]:
-        """One track as it was added, but for its covariances."""
+        """One track as it was added or amended, but for its covariances."""
         track: dict[str, Any] = json.loads(b"".join(self._copied(identity)), object_hook=without_covariance)
         return track
 
