@@ -10,7 +10,7 @@ import pytest
 from clips import write_clip
 
 from visfuse_cli.files.video import open_source
-from visfuse_cli.pipeline import AHEAD, Run, ahead, helper
+from visfuse_cli.pipeline import AHEAD, Run, ahead, foreseen, helper
 from visfuse_cli.records import Frame
 
 
@@ -168,6 +168,15 @@ def test_counts_stages_and_warnings_add_up():
         with run.stage("flow"):
             pass
     assert (run.warnings, run.counts["tracks"], list(run.stages)) == (("same",), 4, ["flow"])
+
+
+@pytest.mark.parametrize("length", [0, 1, 2, 3, 7])
+def test_what_comes_later_is_foreseen_so_far_ahead_and_nothing_is_lost(length):
+    told, taken = [], []
+    for item in foreseen(iter(range(length)), told.append, 2):
+        taken.append(item)
+        assert told == list(range(min(item + 3, length)))
+    assert taken == list(range(length))
 
 
 @pytest.mark.parametrize("cap", ["1", "2"])

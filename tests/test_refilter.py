@@ -41,6 +41,23 @@ def test_tracks_in_step_are_filtered_as_each_alone(kind, motion):
         np.testing.assert_allclose(ours, theirs, rtol=1e-5, atol=1e-6)
 
 
+@pytest.mark.parametrize("kind", ["fading", "ekf"])
+def test_a_track_that_began_on_something_else_finds_its_vehicle(kind):
+    settings = TrackerSettings(filter=FilterSettings(kind=kind))
+    dynamics = dynamics_tools.for_target(settings.target, settings.filter)
+    t, rng = np.arange(110) / 25, np.random.default_rng(4)
+    vehicle = np.column_stack([18 * t, np.zeros(110), np.zeros(110)]) + rng.normal(0, 0.05, (110, 3)) * [1, 1, 0.2]
+    elsewhere = vehicle + np.where(t[:, None] < 1.2, [-9.0, 2.5, 0.0], 0.0)
+    noise = np.diag([0.05, 0.05, 0.02]) ** 2
+    start = dynamics.begin(elsewhere[0], np.array([18.0, 0.0]))
+    (found,) = filter_again(
+        [Poses(t, [dynamics.measured(z, noise) for z in elsewhere], start, 4.4)], settings, dynamics
+    )
+    assert found.trusted[-60:].all()
+    smoothed = dynamics_tools.smooth(dynamics, found.steps).mean
+    np.testing.assert_allclose(smoothed[-50:, :2], np.column_stack([18 * t, 0 * t])[-50:], atol=0.15)
+
+
 @pytest.mark.parametrize("kind", ["fading", "imm"])
 def test_measurements_of_several_targets_are_taken_in_as_one_by_one(kind):
     target = TargetSettings()

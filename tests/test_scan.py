@@ -53,8 +53,7 @@ def test_corners_tell_the_course_and_keep_it_when_they_stand():
         picture = cv2.warpAffine(texture, move, SIZE)
         mask = np.zeros((SIZE[1], SIZE[0]), np.uint8)
         cv2.circle(mask, tuple(int(x) for x in now), 20, 255, -1)
-        points.follow(picture, k / 25.0, mask)
-    found = points.courses()
+        found = points.follow(picture, k / 25.0, mask).courses
     assert len(found.course) >= 3
     assert np.abs(wrap(np.median(found.course) - course)) < 0.1
     assert np.median(np.linalg.norm(found.velocity, axis=1)) < 2.0

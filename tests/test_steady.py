@@ -68,8 +68,11 @@ def test_a_scene_without_contrast_counts_as_steady():
     np.testing.assert_array_equal(Steady(grey).register(grey), np.eye(3))
 
 
-def test_a_picture_laid_back_equals_the_one_at_rest():
-    scene, motion = _scene(), _turned(0.004, 2.4, -1.6)
+@pytest.mark.parametrize(
+    "motion", [_turned(0.004, 2.4, -1.6), _turned(0, 2.4, -1.6), _turned(0, -0.7, 3.0), _turned(0, -2.0, -0.3)]
+)
+def test_a_picture_laid_back_equals_the_one_at_rest(motion: np.ndarray):
+    scene = _scene()
     steady = Steady(_seen(scene, np.eye(3), noise=0))
     back = steady.laid_back(_seen(scene, motion, noise=0), motion)
     error = np.abs(back.astype(int) - _seen(scene, np.eye(3), noise=0))

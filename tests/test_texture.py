@@ -7,7 +7,7 @@ from masks import CAR, TRUCK, road_camera
 from visfuse_cli.maths.cameras import project
 from visfuse_cli.tracking import dynamics as dynamics_tools
 from visfuse_cli.tracking import texture
-from visfuse_cli.tracking.joining import part_before
+from visfuse_cli.tracking.joining import goes_on, part_before
 from visfuse_cli.tracking.settings import VEHICLES, FilterSettings, TargetSettings
 from visfuse_cli.tracking.targets import Sample, Track
 from visfuse_cli.vision.points import Moves
@@ -101,6 +101,27 @@ def test_a_track_goes_on_in_one_that_began_where_it_was_whatever_it_did_after():
     samples, place = part_before(old, dynamics, young.samples, straight(range(28, 60)), CAR)
     assert [sample.frame for sample in samples] == list(range(28))
     np.testing.assert_allclose(place, strays[:28], atol=1e-9)
+
+
+def test_what_a_track_was_before_it_lost_its_vehicle_belongs_to_the_one_that_follows_it():
+    strays = straight(range(50))
+    strays[30:, 0] += 0.3 * np.arange(20)
+    dynamics, old = track_along(1, range(50), strays)
+    _, young = track_along(2, range(28, 60), straight(range(28, 60)))
+    _, beside = track_along(3, range(28, 60), straight(range(28, 60), x=3.5))
+    _, ahead = track_along(4, range(28, 60), straight(range(28, 60)) + [0.0, 6.0, 0.0])
+    _, elder = track_along(5, range(60), straight(range(60)))
+    _, later = track_along(6, range(50, 60), straight(range(50, 60)))
+    assert goes_on(old, young, dynamics)
+    assert not any(goes_on(old, other, dynamics) for other in (beside, ahead, elder, later))
+
+
+def test_a_track_that_was_hardly_seen_is_passed_on_to_nobody():
+    dynamics, old = track_along(1, range(50), straight(range(50)))
+    _, young = track_along(2, range(28, 60), straight(range(28, 60)))
+    for sample in old.samples:
+        sample.border = 0.5
+    assert not goes_on(old, young, dynamics)
 
 
 def test_a_track_beside_another_is_another_vehicle():

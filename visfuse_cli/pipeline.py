@@ -8,7 +8,7 @@ import signal
 import sys
 import threading
 import time
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
@@ -282,15 +282,15 @@ class _Cursor:
         return best
 
 
-def with_next(items: Iterator[T]) -> Iterator[tuple[T, T | None]]:
-    """Each item with the one after it; None after the last."""
-    before = next(items, None)
+def foreseen(items: Iterator[T], foresee: Callable[[T], None], count: int) -> Iterator[T]:
+    """The same items; `foresee` is told of each when `count` others still come before it."""
+    waiting: deque[T] = deque()
     for item in items:
-        assert before is not None
-        yield before, item
-        before = item
-    if before is not None:
-        yield before, None
+        foresee(item)
+        waiting.append(item)
+        if len(waiting) > count:
+            yield waiting.popleft()
+    yield from waiting
 
 
 @contextmanager

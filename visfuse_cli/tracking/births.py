@@ -14,7 +14,6 @@ from visfuse_cli.tracking import dynamics as dynamics_tools
 from visfuse_cli.tracking import measure
 from visfuse_cli.tracking.association import claim, footprint_overlap, region_boxes
 from visfuse_cli.tracking.dynamics import Dynamics, Step
-from visfuse_cli.tracking.elsewhere import HandOver, at_once, nothing
 from visfuse_cli.tracking.evidence import Boxes, Evidence, LabelEvidence
 from visfuse_cli.tracking.hypotheses import HEADING_SIGMA, Guess, best_guess
 from visfuse_cli.tracking.joining import part_before
@@ -23,10 +22,10 @@ from visfuse_cli.tracking.scan import headings, scan, velocity_of
 from visfuse_cli.tracking.settings import TrackerSettings
 from visfuse_cli.tracking.targets import Abandoned, Sample, Track
 from visfuse_cli.vision import wireframe
-from visfuse_cli.vision.points import Courses, Moves, MovingPoints
+from visfuse_cli.vision.points import Courses
 from visfuse_cli.vision.wireframe import DIRECTIONS, Outlines
 
-SCAN_S = 0.3  # s between searches inside of regions
+SCAN_S = 0.3, 1.2  # s between searches inside of a region: at first, and at most
 MOST_GROWN = 2  # of the boxes found there that are followed back
 ASK_AGAIN_S = 0.1, 0.8  # s until a candidate that was none is looked at again: at first, and at most
 COURSE_FRAMES = 25  # the last frames of a candidate that tell its course
@@ -47,30 +46,15 @@ class Candidate:
     asked_again: float = 0.0  # s: not before
     patience: float = ASK_AGAIN_S[0]  # s until then
     scanned_again: float = 0.0  # s: not before
+    scan_patience: float = SCAN_S[0]  # s until then
 
 
 class Nursery:
     """Candidates, and the rule by which they become tracks."""
 
-    def __init__(
-        self, camera: GroundCamera, settings: TrackerSettings, dynamics: Dynamics, hand_over: HandOver = at_once
-    ) -> None:
+    def __init__(self, camera: GroundCamera, settings: TrackerSettings, dynamics: Dynamics) -> None:
         self._camera, self._settings, self._dynamics = camera, settings, dynamics
         self._candidates: list[Candidate] = []
-        self._points, self._hand_over = MovingPoints(camera), hand_over
-        self._watched: Callable[[], None] = nothing  # the corners, which are being followed
-
-    def watch(self, t: float, evidence: Evidence) -> None:
-        """Begin to follow the corners of what moves; people turn and bend, so that theirs tell little."""
-        steers = self._settings.target.motion == "bicycle"
-        if steers and isinstance(evidence, LabelEvidence) and (picture := evidence.picture()) is not None:
-            self._watched()
-            self._watched = self._hand_over(lambda: self._points.follow(picture, t, evidence.paint()))
-
-    def moves(self) -> Moves:
-        """How the corners of what moves went to the present frame."""
-        self._watched()
-        return self._points.moves()
 
     def feed(self, frame: int, t: float, regions: list[Region]) -> None:
         """Give the frame's unexplained regions to candidates, new ones where none fits."""
@@ -113,13 +97,12 @@ class Nursery:
         """Add the vehicles found inside of regions to `tracks`; the next free id."""
         frame, t, evidence = recent[-1]
         due = [c for c in self._candidates if c.missed_since is None and t >= c.scanned_again]
-        if not due or not isinstance(evidence, LabelEvidence):
+        if not due or not isinstance(evidence, LabelEvidence) or (corners := evidence.corners()) is None:
             return next_id
-        self._watched()
-        courses = self._points.courses()
         for candidate in due:
-            candidate.scanned_again = t + SCAN_S
-            guesses = self._guessed(candidate.region, evidence, courses, taken_at(frame))
+            candidate.scanned_again = t + candidate.scan_patience
+            candidate.scan_patience = min(2 * candidate.scan_patience, SCAN_S[1])
+            guesses = self._guessed(candidate.region, evidence, corners.courses, taken_at(frame))
             grown = [
                 track
                 for guess, velocity in guesses[:MOST_GROWN]
@@ -245,6 +228,13 @@ class Nursery:
             if before is not None:
                 return self._track(old.id, before[0] + samples, np.concatenate([before[1], pose]), samples[0].frame)
         return self._track(identity, samples, pose, samples[0].frame)
+
+    def joined(self, old: Track, new: Track) -> Track:
+        """A track with what an older one was before it began."""
+        kept = [sample for sample in old.samples if sample.frame < new.samples[0].frame]
+        was = np.stack([step.posterior.mean for step in (*old.steps[: len(kept)], *new.steps)])
+        pose = np.column_stack([was[:, :2], self._dynamics.heading(was)])
+        return self._track(old.id, kept + new.samples, pose, new.traced_from)
 
     def _track(self, identity: int, samples: list[Sample], pose: Array, traced_from: int) -> Track:
         """A track from its samples so far, its poses (n, 3) in them being roughly known."""

@@ -18,7 +18,3 @@ def at_once(work: Callable[[], T]) -> Callable[[], T]:
     """Work that is done here and now."""
     result = work()
     return lambda: result
-
-
-def nothing() -> None:
-    """The result of work that nobody asked for."""

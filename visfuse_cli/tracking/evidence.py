@@ -12,12 +12,11 @@ from numpy.typing import NDArray
 from visfuse_cli.maths.assignment import assign
 from visfuse_cli.records import Array, GroundCamera, Image, Region
 from visfuse_cli.tracking.association import overlap, region_boxes
-from visfuse_cli.tracking.elsewhere import HandOver, at_once
 from visfuse_cli.vision import contour, regions, wireframe
-from visfuse_cli.vision.background import FOREGROUND
 from visfuse_cli.vision.contour import Fill, Look, Sight
 from visfuse_cli.vision.labels import Labels
-from visfuse_cli.vision.regions import Band
+from visfuse_cli.vision.points import Corners
+from visfuse_cli.vision.regions import Band, Cleaned
 from visfuse_cli.vision.wireframe import Outlines
 
 Boxes = tuple[Array, Array]  # pose (N, 3) and size (N, 3)
@@ -40,12 +39,15 @@ class Evidence(Protocol):
     def leftovers(self, pose: Array, size: Array) -> list[Region]:
         """Regions that the N boxes do not explain."""
 
+    def corners(self) -> Corners | None:
+        """What the corners of that which moves tell in the present frame, where they are followed."""
+
     def pack(self) -> None:
         """Take little memory from now on: the frame is past."""
 
 
 class LabelEvidence:
-    """A labelled picture (255 foreground, 127 shadow)."""
+    """A labelled picture (255 foreground, 127 shadow), and of the present frame the cleaned one and the corners."""
 
     def __init__(
         self,
@@ -55,22 +57,21 @@ class LabelEvidence:
         gap_m: float,
         speck_m: float,
         smallest_m: float,
-        grey: Image | None = None,
-        hand_over: HandOver = at_once,
+        cleaned: Cleaned | None = None,
+        corners: Callable[[], Corners] | None = None,
     ) -> None:
-        self._labels, self._grey = Labels(labels), grey
-        self._cleaned: Callable[[], regions.Cleaned] | None = hand_over(lambda: regions.cleaned(labels, cut, speck_m))
+        self._labels, self._cleaned, self._corners, self._past = Labels(labels), cleaned, corners, False
         self._owned: tuple[bytes, Image] | None = None  # the boxes asked about last, and whose each pixel is
         self._camera, self._cut = camera, cut
         self._gap, self._speck, self._smallest = gap_m, speck_m, smallest_m
 
     def pack(self) -> None:
         self._labels.pack()
-        self._grey = self._owned = self._cleaned = None
+        self._owned = self._cleaned = self._corners = None
+        self._past = True
 
-    def picture(self) -> Image | None:
-        """The grey picture (H, W) of the present frame; None of a past one, or where there is none."""
-        return self._grey
+    def corners(self) -> Corners | None:
+        return None if self._corners is None else self._corners()
 
     def look(self, pose: Array, size: Array, reach: Array) -> Look:
         return contour.search([self._among((pose, size))], np.arange(1, len(pose) + 1), self._camera, pose, size, reach)
@@ -91,7 +92,7 @@ class LabelEvidence:
     def _among(self, boxes: Boxes) -> Sight:
         """What is seen among boxes; the present frame is asked again and again about the same ones."""
         key = boxes[0].tobytes() + boxes[1].tobytes()
-        if self._grey is None:
+        if self._past:
             return Sight(self._labels, contour.owners(self._camera, *boxes))
         if self._owned is None or self._owned[0] != key:
             self._owned = key, contour.owners(self._camera, *boxes)
@@ -103,16 +104,10 @@ class LabelEvidence:
 
     def leftovers(self, pose: Array, size: Array) -> list[Region]:
         if self._cleaned is None:
-            picture = regions.cleaned(self._labels.picture(), self._cut, self._speck)
-        else:
-            picture = self._cleaned()
-        found = regions.find(picture, self._cut, self._gap, self._smallest, self._explained(pose, size))
+            self._cleaned = regions.cleaned(self._labels.picture(), self._cut, self._speck)
+        found = regions.find(self._cleaned, self._cut, self._gap, self._smallest, self._explained(pose, size))
         lens = self._camera.ground.lens
         return found if lens is None else [regions.undistorted(region, lens) for region in found]
-
-    def paint(self) -> Image:
-        """Mask (H, W), 255 where something differs from the background that is no shadow."""
-        return np.asarray(cv2.compare(self._labels.picture(), FOREGROUND, cv2.CMP_EQ), dtype=np.uint8)
 
     def _explained(self, pose: Array, size: Array) -> Image:
         """Mask (H, W), 255 in and close to the silhouettes of N boxes."""
@@ -155,6 +150,9 @@ class BoxEvidence:
 
     def outlines(self, pose: Array, size: Array, reach: Array, taken: Boxes) -> Outlines:
         return self.probe(pose, size, reach, taken).outlines
+
+    def corners(self) -> Corners | None:
+        return None
 
     def pack(self) -> None:
         """A few boxes are little."""

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from typing import Any, Literal, Protocol
 
 import cv2
@@ -12,16 +14,19 @@ from pydantic import Field
 from visfuse_cli.config import Section
 from visfuse_cli.maths.homography import apply
 from visfuse_cli.records import Array, Frame, GroundCamera, Image
-from visfuse_cli.tracking.elsewhere import HandOver, at_once, nothing
+from visfuse_cli.tracking.elsewhere import HandOver, at_once
 from visfuse_cli.tracking.evidence import Boxes, BoxEvidence, Evidence, LabelEvidence
 from visfuse_cli.tracking.ground import GroundTracker
 from visfuse_cli.tracking.sun import Shade, Sun, shadow_picture
 from visfuse_cli.tracking.zones import Region
 from visfuse_cli.vision import contour, wireframe
 from visfuse_cli.vision import regions as region_tools
-from visfuse_cli.vision.background import Background
+from visfuse_cli.vision.background import FOREGROUND, Background
+from visfuse_cli.vision.points import Corners, MovingPoints
+from visfuse_cli.vision.regions import Cleaned
 from visfuse_cli.vision.steady import moved
 
+LEARNING = 3  # frames that may still wait to be learnt
 SETTLED = 12  # frames after which a track's size is known well enough to tell its shadow
 
 
@@ -48,16 +53,28 @@ class Detector(Protocol):
     """A source of evidence, asked frame by frame."""
 
     def foresee(self, frame: Frame) -> None:
-        """Begin to look at the frame that comes after the present one, while that is thought about."""
+        """Begin to look at the frame that comes after those foreseen before, while another is thought about."""
 
     def evidence(self, frame: Frame, expected: Boxes) -> Evidence:
-        """What a frame says, in which boxes are expected."""
+        """What the first of the frames foreseen says, in which boxes are expected."""
 
     def learn(self, frame: Frame, tracker: GroundTracker) -> None:
         """Adapt to a frame, except where something is followed."""
 
     def report(self) -> dict[str, Any] | None:
         """Where the sun stands, where that was found."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Seen:
+    """A frame against the background: its labels (H, W), all of them and those watched, and these cleaned."""
+
+    raw: Image
+    labels: Image
+    cleaned: Cleaned
+
+
+_Foreseen = tuple[Callable[[], _Seen], Callable[[], Corners] | None]  # what a frame shows and its corners, once asked
 
 
 class MovingRegions:
@@ -71,47 +88,66 @@ class MovingRegions:
         smallest_m: float,
         empty: Image,
         region: Region | None = None,
-        hand_over: HandOver = at_once,
+        corners: MovingPoints | None = None,
+        compare: HandOver = at_once,
+        follow: HandOver = at_once,
     ) -> None:
-        self._camera, self._hand_over = camera, hand_over
+        self._camera, self._corners = camera, corners
+        self._compare, self._follow = compare, follow
         self._cleaning = cleaning.gap, cleaning.speck, smallest_m
         self._bands = region_tools.bands(camera)
         self._background = Background(
             background.model, background.threshold, background.shadow_ratio, background.memory_s
         )
         self._background.start(empty)
-        self._empty = empty  # the scene as it was learnt before the last frame: nobody waits for what is being learnt
+        self._empty = empty  # the scene as it was learnt a few frames ago: nobody waits for what is being learnt
         self._watched = None if region is None else region.picture(camera)
         self._sun, self._shade = Sun(camera), Shade(background.shadow_ratio)
-        self._found: Callable[[], tuple[Image, Image]] | None = None  # labels and grey picture, made ahead
-        self._learnt: Callable[[], None] = nothing  # what is being learnt
+        self._foreseen: deque[_Foreseen] = deque()
+        self._learning: deque[Callable[[], Image]] = deque()
         self._raw = self._labels = np.zeros((0, 0), np.uint8)
 
     def foresee(self, frame: Frame) -> None:
-        self._found = self._hand_over(lambda: (self._background.detect(frame.image), grey_of(frame.image)))
+        seen, corners = self._compare(lambda: self._see(frame.image)), self._corners
+        if corners is None:
+            self._foreseen.append((seen, None))
+        else:
+            followed = self._follow(lambda: corners.follow(grey_of(frame.image), frame.t, paint_of(seen().labels)))
+            self._foreseen.append((seen, followed))
 
-    def evidence(self, frame: Frame, expected: Boxes) -> Evidence:
-        if self._found is None:
-            self.foresee(frame)
-        assert self._found is not None
-        labels, grey = self._found()
-        self._found, self._raw = None, labels
+    def _see(self, image: Image) -> _Seen:
+        raw = labels = self._background.detect(image)
         if self._watched is not None:
             labels = np.asarray(cv2.bitwise_and(labels, self._watched), dtype=np.uint8)
+        return _Seen(raw, labels, self._clean(labels))
+
+    def evidence(self, frame: Frame, expected: Boxes) -> Evidence:
+        awaited, corners = self._foreseen.popleft()
+        seen = awaited()
+        self._raw, labels, cleaned = seen.raw, seen.labels, seen.cleaned
         if self._sun.shadow is not None and self._shade.needed and len(expected[0]):
             where = shadow_picture(self._camera, *expected, self._sun.shadow.per_metre)
             labels = self._shade.cut(labels, frame.image, self._empty, where)
+            if labels is not seen.labels:
+                cleaned = self._clean(labels)
         self._labels = labels
-        return LabelEvidence(labels, self._camera, self._bands, *self._cleaning, grey, self._hand_over)
+        return LabelEvidence(labels, self._camera, self._bands, *self._cleaning, cleaned, corners)
+
+    def _clean(self, labels: Image) -> Cleaned:
+        return region_tools.cleaned(labels, self._bands, self._cleaning[1])
 
     def learn(self, frame: Frame, tracker: GroundTracker) -> None:
         pose, size = tracker.boxes()
         settled = np.array([len(t.samples) >= SETTLED and t.samples[-1].measured for t in tracker.tracks], dtype=bool)
         self._sun.look(frame.t, self._labels, pose, size, settled, [track.id for track in tracker.tracks])
         followed, raw = self._outlines(pose, size), self._raw
-        self._learnt()
-        self._empty = self._background.picture
-        self._learnt = self._hand_over(lambda: self._background.learn(frame.image, frame.t, followed, raw))
+        self._learning.append(self._compare(lambda: self._learnt(frame, followed, raw)))
+        if len(self._learning) > LEARNING:
+            self._empty = self._learning.popleft()()
+
+    def _learnt(self, frame: Frame, followed: Iterator[Array], raw: Image) -> Image:
+        self._background.learn(frame.image, frame.t, followed, raw)
+        return self._background.picture
 
     def _outlines(self, pose: Array, size: Array) -> Iterator[Array]:
         """Outlines (k, 2) px of N boxes as the footage shows them, found when they are asked for: few frames are."""
@@ -120,13 +156,19 @@ class MovingRegions:
                 yield hull
 
     def report(self) -> dict[str, Any] | None:
-        self._learnt()
+        while self._learning:
+            self._learning.popleft()()
         return None if self._sun.shadow is None else self._sun.shadow.report()
 
 
 def grey_of(image: Image) -> Image:
     """A picture (H, W, 3) in grey (H, W)."""
     return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), dtype=np.uint8)
+
+
+def paint_of(labels: Image) -> Image:
+    """Mask (H, W), 255 where something differs from the background that is no shadow."""
+    return np.asarray(cv2.compare(labels, FOREGROUND, cv2.CMP_EQ), dtype=np.uint8)
 
 
 class Detections:

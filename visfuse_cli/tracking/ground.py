@@ -20,11 +20,10 @@ from visfuse_cli.tracking import endings, measure, texture
 from visfuse_cli.tracking.association import footprint_overlap
 from visfuse_cli.tracking.births import Nursery
 from visfuse_cli.tracking.dynamics import Dynamics, Prediction, Step
-from visfuse_cli.tracking.elsewhere import HandOver, at_once
 from visfuse_cli.tracking.endings import ONE_PLACE, trimmed
 from visfuse_cli.tracking.evidence import Boxes, Evidence
 from visfuse_cli.tracking.hypotheses import LEAST_OPEN, Guess, gains
-from visfuse_cli.tracking.joining import WAIT_S, lasting
+from visfuse_cli.tracking.joining import WAIT_S, goes_on, lasting
 from visfuse_cli.tracking.lookback import Recent
 from visfuse_cli.tracking.settings import TrackerSettings
 from visfuse_cli.tracking.targets import Abandoned, Comparison, Sample, Track
@@ -36,11 +35,12 @@ YOUNG, LEAP = 12, 4.0  # frames after which one measurement may not change the v
 SEEN_SHARE = 0.4  # of the unhidden area of a box that must have moved and of its border that must be found
 LIKENESS_S = 0.4  # s over which the share of the border that is found is averaged
 DOUBTFUL, MOVED_M = 0.25, 2.0  # share of the border that is not clear, to compare, and again so many m further
-WAIT_AT_MOST_S = 4.0  # before a doubtful track is compared again
-BETTER, COMPARED = 1.2, 8  # times as much must another box explain, over so many of the last frames
+WAIT_AT_MOST_S = 6.0  # before a doubtful track is compared again
+BETTER, COMPARED = 1.2, 8  # times as much then, over so many of the last frames
 LOOK_BACK_FRAMES = 120  # at most
 HIDDEN = 0.8  # of a box in view, below which the corners on it are asked how fast it goes
 REACH_PX, REACH_SHARE = (4.0, 24.0), 0.2  # how far from its prediction an outline is looked for; of its height
+MISLED = ("no longer looks like itself", "jumped", "lost")  # ends of tracks that may have left their vehicle
 BESIDE_M = 6.0  # m between two tracks that may be parts of one vehicle
 
 
@@ -50,16 +50,14 @@ class GroundTracker:
     Each frame: `predict(t)`, then `update(frame, evidence)`, which returns what ended.
     """
 
-    def __init__(
-        self, camera: GroundCamera, settings: TrackerSettings, first_id: int = 1, hand_over: HandOver = at_once
-    ) -> None:
+    def __init__(self, camera: GroundCamera, settings: TrackerSettings, first_id: int = 1) -> None:
         self.camera = camera
         self.settings = settings
         self.dynamics: Dynamics = dynamics_tools.for_target(settings.target, settings.filter)
         self.tracks: list[Track] = []
         self.unexplained: list[ImageRegion] = []  # what moved in the last frame and belongs to no track
         self.next_id = first_id
-        self._nursery = Nursery(camera, settings, self.dynamics, hand_over)
+        self._nursery = Nursery(camera, settings, self.dynamics)
         self._region = Region(np.array(settings.region)) if settings.region else None
         self._gate = gate_size(len(self.dynamics.H), settings.pose.gate)
         self._t = 0.0
@@ -81,7 +79,6 @@ class GroundTracker:
 
     def update(self, frame: int, evidence: Evidence) -> tuple[list[Track], list[Abandoned]]:
         """Measure every track, and let the rest become tracks; returns the tracks and candidates that ended."""
-        self._nursery.watch(self._t, evidence)
         if self.tracks:
             self._measure(frame, evidence)
         self._remember(frame, evidence)
@@ -146,7 +143,7 @@ class GroundTracker:
         border = np.where(np.isnan(look.likeness), look.border, look.likeness) * fit.agreed
         there = fit.ok & measure.looks_right(fit, look.outlines) & (look.moved > SEEN_SHARE) & ~(border < SEEN_SHARE)
         there &= look.open > LEAST_OPEN
-        along, pace, doubt = self._paces(pose, size, look.open < HIDDEN)
+        along, pace, doubt = self._paces(pose, size, look.open < HIDDEN, evidence)
         for k, track in enumerate(self.tracks):
             step = dynamics_tools.coast(self._expected[k])
             if np.isfinite(border[k]):
@@ -170,15 +167,17 @@ class GroundTracker:
             track.samples.append(sample)
             track.steps.append(step)
 
-    def _paces(self, pose: Array, size: Array, hidden: NDArray[np.bool_]) -> tuple[Array, Array, Array]:
+    def _paces(
+        self, pose: Array, size: Array, hidden: NDArray[np.bool_], evidence: Evidence
+    ) -> tuple[Array, Array, Array]:
         """Headings (N, 2), and speeds (N,) m/s along them with their deviations (N,), as the corners on the boxes that
         are partly `hidden` (N,) tell; NaN of the others."""
         along = np.column_stack([np.cos(pose[:, 2]), np.sin(pose[:, 2])])
-        if not hidden.any():
+        if not hidden.any() or (corners := evidence.corners()) is None:
             return along, np.full(len(pose), np.nan), np.full(len(pose), np.nan)
-        velocity = np.array([self.dynamics.planar(each.prior.mean)[0][2:] for each in self._expected])
+        velocity = self.dynamics.planar(np.array([each.prior.mean for each in self._expected]))[0][:, 2:]
         expected = np.sum(velocity * along, axis=1)
-        pace, doubt = texture.paces(self.camera, pose, size, expected, self._nursery.moves())
+        pace, doubt = texture.paces(self.camera, pose, size, expected, corners.moves)
         return along, np.where(hidden, pace, np.nan), doubt
 
     def _reconsider(self, evidence: Evidence) -> None:
@@ -282,8 +281,10 @@ class GroundTracker:
         gamma = dynamics_tools.residual(self.dynamics, z, step.prior.mean)
         if mahalanobis(gamma, H @ step.prior.cov @ H.T + R) > self._gate:
             return False
-        before, after = (self.dynamics.planar(x)[0][2:] for x in (step.prior.mean, step.posterior.mean))
-        return len(track.samples) < YOUNG or float(np.hypot(*(after - before))) < LEAP
+        if len(track.samples) < YOUNG:
+            return True
+        before, after = self.dynamics.planar(np.stack([step.prior.mean, step.posterior.mean]))[0][:, 2:]
+        return float(np.hypot(*(after - before))) < LEAP
 
     def _learn_size(self, track: Track, fit: wireframe.BoxFit, k: int) -> None:
         # Frames of one target share their errors (the same light, the same shadow): each counts as a tenth.
@@ -301,4 +302,12 @@ class GroundTracker:
         )
         ended = [trimmed(track, why) for track, why in zip(self.tracks, reasons, strict=True) if why]
         self.tracks = [track for track, why in zip(self.tracks, reasons, strict=True) if not why]
-        return ended
+        return [track for track in ended if track.ended_by not in MISLED or not self._passed_on(track)]
+
+    def _passed_on(self, ended: Track) -> bool:
+        """Whether what a track was before it lost its vehicle now belongs to the one that follows that vehicle."""
+        for k, track in enumerate(self.tracks):
+            if goes_on(ended, track, self.dynamics):
+                self.tracks[k] = self._nursery.joined(ended, track)
+                return True
+        return False

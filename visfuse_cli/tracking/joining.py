@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from bisect import bisect_left
+
 import numpy as np
 
 from visfuse_cli.maths.angles import wrap
@@ -11,12 +13,13 @@ from visfuse_cli.tracking.targets import Sample, Track
 
 CLOSE_M = 2.0  # between the places that both have for one moment
 DRIFT = 0.2  # m a metre driven unseen: drivers brake and accelerate
+AT_ONCE_S = 0.2  # s
 ASIDE_M, TURNED = 1.5, 0.7  # m off the course and rad turned, while unseen
 PART = 0.4  # of both lengths: a part of a vehicle that was followed as one lies that far off
 SAME = 0.5  # share of the common frames in which one stands in the place of the other
 BELIEVED = 0.7  # share of the outline seen, on average, that makes an earlier stretch worth keeping
 WAIT_S = 3.0, 6.0  # s unseen, of what moves and of what stands in a queue
-SLOW, STARTS = 2.0, 1.0  # m/s below which it stands, and m/s^2 that it starts with
+SLOW, STARTS = 2.0, 1.5  # m/s below which it stands, and m/s^2 that it starts with
 ALIKE = 0.25  # of the logarithm of its length
 
 
@@ -36,6 +39,20 @@ def part_before(
     if not one:
         return None
     return (kept, place[: len(kept)]) if fits and _good(kept) else ([], np.zeros((0, 3)))
+
+
+def goes_on(old: Track, new: Track, dynamics: Dynamics) -> bool:
+    """Whether a track that has ended was in the place of a younger one when that began, having been seen well before:
+    it then lost its vehicle to it."""
+    k = bisect_left(old.samples, new.samples[0].frame, key=lambda sample: sample.frame)
+    if not 0 < k < len(old.samples):
+        return False
+    was, began = old.steps[k].posterior.mean, new.steps[0].posterior.mean
+    heading = float(dynamics.heading(began))
+    turned = abs(wrap(float(dynamics.heading(was)) - heading))
+    (x, y), (c, s) = (was - began)[:2], (np.cos(heading), np.sin(heading))
+    near = abs(c * x + s * y) < PART * (old.size[0] + new.size[0]) and abs(c * y - s * x) < ASIDE_M
+    return bool(near and turned < TURNED and _alike(old.size, new.size) and _good(old.samples[:k]))
 
 
 def _while_both(old: Track, place: Array, samples: list[Sample], pose: Array, size: Array) -> tuple[bool, bool]:
@@ -68,7 +85,8 @@ def _drives_on(old: Track, planar: Array, heading: float, t: float, pose: Array,
     on, off = float(offset @ way), float(way[0] * offset[1] - way[1] * offset[0])
     turn = abs(wrap(pose[2] - np.arctan2(way[1], way[0])))
     reach = CLOSE_M + DRIFT * gap * speed
-    near = -reach < on < reach + slow * STARTS * gap**2 / 2 and abs(off) < ASIDE_M and turn < TURNED
+    at_once = gap < AT_ONCE_S and float(np.hypot(*offset)) < ASIDE_M  # nothing else can have come there meanwhile
+    near = -reach < on < reach + slow * STARTS * gap**2 / 2 and abs(off) < ASIDE_M and (turn < TURNED or at_once)
     return bool(near and (gap < WAIT_S[0] or (slow and _alike(size, old.size) and gap < WAIT_S[1])))
 
 

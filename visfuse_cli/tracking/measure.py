@@ -12,8 +12,14 @@ from visfuse_cli.tracking.settings import PoseSettings, SizePrior
 from visfuse_cli.vision import wireframe
 from visfuse_cli.vision.wireframe import BoxFit, Outlines
 
+SLIM, SLIM_M = 0.5, 1.0  # of its length, and m: what is less wide is slim
 HEADING_SIGMA = 0.25  # rad: prior of a fit around the predicted heading, taken out of the measurement again
 POSITION_SIGMA = 5.0  # m: keeps a half-hidden box from wandering off, without weight in an ordinary fit
+
+
+def is_slim(size: Array) -> NDArray[np.bool_]:
+    """Which (...) of the sizes (..., 3) m are long and narrow, like windows and gaps between vehicles."""
+    return np.asarray((size[..., 1] < SLIM * size[..., 0]) & (size[..., 1] < SLIM_M))
 
 
 def prior_arrays(prior: SizePrior) -> tuple[Array, Array]:

@@ -20,6 +20,7 @@ from visfuse_cli.tracking.targets import Sample
 START_DOUBT = 5.0  # times the deviations a new track begins with
 SETTLING = 12  # measurements until that doubt is gone
 START_S, LEAST_START = 1.5, 5  # s, and measurements, from which the start is estimated
+ASTRAY = 10  # measurements outside the gate, one after another, after which they are right and the belief is not
 LEAST_TOLD = 5  # innovations that tell the noise
 
 Measured = tuple[Array, Array]  # z (m,) and R (m, m)
@@ -97,7 +98,7 @@ def _in_step(tracks: Sequence[Poses], noise: Array, gate: float, dynamics: Dynam
         Refiltered([dynamics_tools.first(dynamics, track.start)], np.zeros(len(track.t), dtype=bool))
         for track in tracks
     ]
-    count = [0] * len(tracks)
+    count, astray = [0] * len(tracks), [0] * len(tracks)  # measurements since it began, and the last outside the gate
     for k in range(max(len(track.t) for track in tracks)):
         alive = [i for i, track in enumerate(tracks) if k < len(track.t)]
         # The record of residuals begins when the belief has settled: the first doubt is no sign of a manoeuvre.
@@ -109,6 +110,8 @@ def _in_step(tracks: Sequence[Poses], noise: Array, gate: float, dynamics: Dynam
         expected = dynamics_tools.predict(dynamics, before, dt, np.array([tracks[i].length for i in alive]))
         seen: list[tuple[int, Prediction, Measured]] = []
         for i, prediction in zip(alive, expected, strict=True):
+            if astray[i] >= ASTRAY:
+                count[i], astray[i], prediction = 0, 0, _begun_again(prediction, tracks[i].start)
             found[i].steps.append(dynamics_tools.coast(prediction))
             if (now := tracks[i].measured[k]) is not None:
                 seen.append((i, prediction, now))
@@ -119,9 +122,15 @@ def _in_step(tracks: Sequence[Poses], noise: Array, gate: float, dynamics: Dynam
         for i, step, trusted in zip(which, taken, close, strict=True):
             found[i].steps[-1], found[i].trusted[k] = step, trusted
             count[i] += 1
+            astray[i] = 0 if trusted else astray[i] + 1
     for each in found:
         del each.steps[0]  # before the first frame
     return found
+
+
+def _begun_again(expected: Prediction, start: Gaussian) -> Prediction:
+    """What is expected of a target, with the doubt of one that has just begun."""
+    return replace(expected, prior=Gaussian(expected.prior.mean, expected.prior.cov + start.cov), memory=None)
 
 
 def _taken(

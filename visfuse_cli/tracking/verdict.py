@@ -13,6 +13,7 @@ from visfuse_cli.config import Section
 from visfuse_cli.maths.speed import KMH, way
 from visfuse_cli.records import Array
 from visfuse_cli.tracking.conclude import Path
+from visfuse_cli.tracking.measure import is_slim
 
 Z95 = 1.959964
 STANDS = 0.3  # m/s
@@ -21,6 +22,7 @@ SIZE_DOUBT = 0.03  # of a size: no vehicle is quite a box
 GOOD_ENOUGH, LONGER_FOR = 0.01, 1.5  # standard deviation of a speed over itself
 DOUBTFUL_ENDS, SHORT_S = ("jumped", "no longer looks like itself"), 1.0  # s: a track that does so sooner is nothing
 APART, SOLID, LASTING, SHORT_LOOK_S = 2.5, 0.9, 0.18, 2.0  # a logistic fit to traffic, true tracks against false ones
+LIKE_A_PART = 0.2  # what it takes off that a slim thing looks like parts of others
 UNSEEN_S = 1.5  # s: a stretch goes over no longer gap
 JUMP_S = 0.3  # s a change of speed is looked at
 SUDDEN = 1.5  # times as much as it is counts what a vehicle gains: it cannot as fast as it brakes
@@ -186,7 +188,7 @@ def evidence(path: Path) -> float:
     """How much speaks for a track: its outline, apart from others, filled, and the time for which it was seen."""
     seen = path.measured.mean() * (path.t[-1] - path.t[0])
     shown = path.support + APART * path.apart + SOLID * path.paint
-    return float(shown + LASTING * np.log(max(seen, SHORT_LOOK_S) / SHORT_LOOK_S))
+    return float(shown - LIKE_A_PART * is_slim(path.size) + LASTING * np.log(max(seen, SHORT_LOOK_S) / SHORT_LOOK_S))
 
 
 def _jumps(path: Path) -> Array:

@@ -46,6 +46,14 @@ class Courses:
         return Courses(self.place[which], self.velocity[which], self.course[which])
 
 
+@dataclass(frozen=True, slots=True)
+class Corners:
+    """What the corners in a picture tell."""
+
+    moves: Moves
+    courses: Courses
+
+
 class MovingPoints:
     """Corners inside a mask, followed by pyramids (Lucas and Kanade) at a bounded width."""
 
@@ -54,36 +62,29 @@ class MovingPoints:
         self._scale = max(1.0, camera.image_size[0] / WIDTH_PX)
         self._last: Image | None = None
         self._place = np.zeros((0, 2), np.float32)  # px of the small picture
-        self._moves = Moves(np.zeros((0, 2)), np.zeros((0, 2)), 1.0)
         self._ground = np.zeros((0, 2))  # m
         self._velocity = np.zeros((0, 2))  # m/s, smoothed; NaN before the second picture
         self._anchor = np.zeros((0, 4))  # u, v, X, Y from which the present stretch is counted
         self._course = np.zeros(0)  # rad; NaN: not known yet
         self._sought = self._t = -np.inf
 
-    def follow(self, picture: Image, t: float, wanted: Image) -> None:
-        """Take in a grey picture (H, W) at t (s); corners live where `wanted` (H, W) is not 0."""
+    def follow(self, picture: Image, t: float, wanted: Image) -> Corners:
+        """Take in a grey picture (H, W) at t (s), and what it tells; corners live where `wanted` (H, W) is not 0."""
         size = (round(picture.shape[1] / self._scale), round(picture.shape[0] / self._scale))
         small = cv2.resize(picture, size, interpolation=cv2.INTER_AREA) if self._scale > 1 else picture
         mask = cv2.resize(wanted, size, interpolation=cv2.INTER_NEAREST) if self._scale > 1 else wanted
+        moves = Moves(np.zeros((0, 2)), np.zeros((0, 2)), 1.0)
         if len(self._place) and self._last is not None:
             before = self._pixels()
             kept = self._advance(small, mask)
-            self._moves = Moves(before[kept], self._pixels(), max(t - self._t, 1e-6))
+            moves = Moves(before[kept], self._pixels(), max(t - self._t, 1e-6))
             self._tell(t)
         if t - self._sought >= SEEK_S:
             self._sought = t
             self._seek(small, mask)
         self._last, self._t = small, t
-
-    def courses(self) -> Courses:
-        """The corners whose course is known."""
         known = np.isfinite(self._course) & np.isfinite(self._velocity[:, 0])
-        return Courses(self._pixels()[known], self._velocity[known], self._course[known])
-
-    def moves(self) -> Moves:
-        """How the corners went from the picture before the last one to the last one."""
-        return self._moves
+        return Corners(moves, Courses(self._pixels()[known], self._velocity[known], self._course[known]))
 
     def _pixels(self) -> Array:
         pixels = (self._place.astype(float) + 0.5) * self._scale - 0.5

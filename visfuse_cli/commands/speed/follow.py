@@ -12,7 +12,7 @@ import numpy as np
 
 from visfuse_cli.files.spool import TrackSpool
 from visfuse_cli.files.video import VideoSource
-from visfuse_cli.pipeline import Run, ahead, helper, with_next
+from visfuse_cli.pipeline import Run, ahead, foreseen, helper
 from visfuse_cli.records import Array, Frame, GroundCamera, Image, TimeAudit
 from visfuse_cli.threads import give_back, thread_cap
 from visfuse_cli.tracking.camera_watch import CameraWatch
@@ -26,10 +26,12 @@ from visfuse_cli.tracking.privacy import Strangers
 from visfuse_cli.tracking.targets import Abandoned, Track
 from visfuse_cli.tracking.zones import Region
 from visfuse_cli.vision.empty import empty_picture
+from visfuse_cli.vision.points import MovingPoints
 from visfuse_cli.vision.steady import at_rest
 
 WARMUP_PICTURES = 31
 TOGETHER = 500  # frames of tracks that have ended wait for one another: settling them at once takes less time
+FORESEEN = 3  # frames that are compared with the background before their turn
 STEADIED_PX = 0.3  # what is left of a shake between two pictures, at most
 
 
@@ -63,21 +65,19 @@ def follow(clip: Clip, run_: Run, spool: TrackSpool, findings: Findings, first_i
     cv2.setNumThreads(thread_cap() or max(1, cv2.getNumberOfCPUs() - 1))
     findings.ledger.drawn[clip.name] = []
     strangers = findings.strangers[clip.name] = Strangers(clip.camera)
-    with helper() as look_over, helper() as follow_corners:
+    with helper() as compare, helper() as follow_corners:
         with run_.stage("warm up"):
             empty = _empty_scene(clip.source, clip.config.background.warmup_s)
             give_back()
             watch = findings.watches[clip.name] = CameraWatch(empty)
-            look, lamps = _detector(clip, empty, look_over), Headlights(empty, clip.camera)
-        tracker = GroundTracker(clip.camera, clip.config, first_id, follow_corners)
+            look, lamps = _detector(clip, empty, compare, follow_corners), Headlights(empty, clip.camera)
+        tracker = GroundTracker(clip.camera, clip.config, first_id)
         of = Recording(clip.name, label, clip.camera, findings.began[clip.name], watch.image_from_rest)
         settling = _Settling(of, tracker, lamps, run_, spool, findings.ledger)
-        for frame, following in with_next(_steadied(clip.source, watch, run_)):
+        for frame in foreseen(_steadied(clip.source, watch, run_), look.foresee, FORESEEN):
             tracker.predict(frame.t)
             with run_.stage("detect"):
                 evidence = look.evidence(frame, tracker.expected())
-            if following is not None:
-                look.foresee(following)
             with run_.stage("track"):
                 ended = tracker.update(frame.index, evidence)
                 if clip.config.privacy.blur:
@@ -111,13 +111,16 @@ def _steadied(source: VideoSource, watch: CameraWatch, run_: Run) -> Iterator[Fr
             yield frame
 
 
-def _detector(clip: Clip, empty: Image, hand_over: HandOver) -> Detector:
+def _detector(clip: Clip, empty: Image, compare: HandOver, follow_corners: HandOver) -> Detector:
     config = clip.config
     region = Region(np.array(config.region)) if config.region else None
     if clip.boxes is not None:
         return Detections(clip.camera, clip.boxes, region)
+    # People turn and bend: their corners tell little.
+    corners = MovingPoints(clip.camera) if config.target.motion == "bicycle" else None
+    smallest = config.target.smallest
     return MovingRegions(
-        clip.camera, config.background, config.regions, config.target.smallest, empty, region, hand_over
+        clip.camera, config.background, config.regions, smallest, empty, region, corners, compare, follow_corners
     )
 
 
