@@ -12,7 +12,7 @@ from visfuse_cli.maths.polygons import area, contains, distance, surrounding
 from visfuse_cli.tracking.conclude import conclude
 from visfuse_cli.tracking.ground import GroundTracker
 from visfuse_cli.tracking.settings import TrackerSettings
-from visfuse_cli.tracking.verdict import SpeedSettings, judge
+from visfuse_cli.tracking.verdict import LIKE_A_PART, SpeedSettings, evidence, judge
 from visfuse_cli.tracking.zones import Region, stretch, trusted
 
 CAMERA = road_camera()
@@ -123,6 +123,31 @@ def test_a_track_outside_the_trusted_zone_is_rejected_with_that_reason(passing):
         for zone in (True, False)
     ]
     assert verdicts == ["", "outside the trusted zone"]
+
+
+def test_noise_rejects_where_a_vague_calibration_does_not(passing):
+    _, settings, tracker, (track,) = passing
+    (path,) = conclude([track], CAMERA, settings, tracker.dynamics)
+
+    def reason(seen, entry_cov):
+        return judge(seen, entry_cov, 1.0, SpeedSettings(), np.ones(len(seen.t), dtype=bool)).reason
+
+    H = CAMERA.ground.ground_from_image
+    lengths = np.append(H[:2].ravel(), [0.0, 0.0, 0.0])  # what is all of it wrong when the surveyor's tape is
+    vague = 0.05**2 * np.outer(lengths, lengths)
+    assert reason(path, vague) == ""
+    assert judge(path, vague, 1.0, SpeedSettings(), np.ones(len(path.t), dtype=bool)).sigma > 0.04 * 8.9
+    noisy = replace(path, pose_cov=path.pose_cov + np.diag([1.0, 1.0, 0.0, 0.0]))
+    assert reason(path, CAMERA.ground.cov) == ""
+    assert reason(noisy, CAMERA.ground.cov).startswith("too uncertain")
+
+
+def test_what_is_slim_must_be_seen_better(passing):
+    _, settings, tracker, (track,) = passing
+    (path,) = conclude([track], CAMERA, settings, tracker.dynamics)
+    bike, person = (replace(path, size=np.array(size)) for size in ([2.0, 0.7, 1.5], [0.5, 0.5, 1.7]))
+    assert evidence(bike) == pytest.approx(evidence(path) - LIKE_A_PART)
+    assert evidence(person) == evidence(path)
 
 
 @pytest.mark.parametrize("frames", [slice(10, 40), slice(10, 11)], ids=["a stretch", "one frame"])

@@ -22,6 +22,7 @@ from visfuse_cli.vision.wireframe import BoxFit
 REACHES_PX = (24.0, 12.0, 6.0)  # how far around a hypothesis its border is looked for, coarse to fine
 BORDER_SEEN, AREA_MOVED = 0.6, 0.6  # shares of its border and its area that must be found
 CLEAR = 0.4  # share of its border that must have background outside: a window of a grey car has paint
+SLIM_SEEN, SLIM_CLEAR = 0.75, 0.6  # the same of what is slim: a part of a vehicle is like it
 FOOT_SEEN = 0.5  # share of its border on the ground that must be found: a part of a vehicle stands on nothing
 LEAST_OPEN = 0.2  # of a box in view to measure it
 OPEN, SHOWN = 0.5, 0.45  # of its area that must be in view, and of all of its border that must be found
@@ -110,6 +111,7 @@ def refined(
     stands &= ~np.any(footprint_overlap(pose, size, *taken) > ONE_PLACE, axis=1)
     good = fit.ok & usual & measure.looks_right(fit, look.outlines) & (look.moved > AREA_MOVED)
     good &= (clear & stands) if convincing else (look.open > LEAST_OPEN)
+    good &= ~measure.is_slim(size) | ((look.border > SLIM_SEEN) & (look.clear > SLIM_CLEAR))
     gain = _gain(look, area)
     good &= gain > 0
     gain = gain * np.exp(-USUAL_WEIGHT * np.sum(((size - mean) / sigma) ** 2, axis=1))

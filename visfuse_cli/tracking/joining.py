@@ -13,7 +13,7 @@ from visfuse_cli.tracking.targets import Sample, Track
 
 CLOSE_M = 2.0  # between the places that both have for one moment
 DRIFT = 0.2  # m a metre driven unseen: drivers brake and accelerate
-AT_ONCE_S = 0.2  # s
+AT_ONCE_S, NEXT = 0.2, 0.35  # s, and of its length: what begins so soon and so near is the same
 ASIDE_M, TURNED = 1.5, 0.7  # m off the course and rad turned, while unseen
 PART = 0.4  # of both lengths: a part of a vehicle that was followed as one lies that far off
 SAME = 0.5  # share of the common frames in which one stands in the place of the other
@@ -85,7 +85,7 @@ def _drives_on(old: Track, planar: Array, heading: float, t: float, pose: Array,
     on, off = float(offset @ way), float(way[0] * offset[1] - way[1] * offset[0])
     turn = abs(wrap(pose[2] - np.arctan2(way[1], way[0])))
     reach = CLOSE_M + DRIFT * gap * speed
-    at_once = gap < AT_ONCE_S and float(np.hypot(*offset)) < ASIDE_M  # nothing else can have come there meanwhile
+    at_once = gap < AT_ONCE_S and float(np.hypot(*offset)) < NEXT * size[0]  # nothing else can be there
     near = -reach < on < reach + slow * STARTS * gap**2 / 2 and abs(off) < ASIDE_M and (turn < TURNED or at_once)
     return bool(near and (gap < WAIT_S[0] or (slow and _alike(size, old.size) and gap < WAIT_S[1])))
 

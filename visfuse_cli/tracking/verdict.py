@@ -17,6 +17,7 @@ from visfuse_cli.tracking.measure import is_slim
 
 Z95 = 1.959964
 STANDS = 0.3  # m/s
+STEADY = 6.0  # m/s: of what is slower a share of the speed is too little to ask for
 TURN_M = 0.25  # m a radian: the middle of a fitted box shifts as the vehicle shows another side
 SIZE_DOUBT = 0.03  # of a size: no vehicle is quite a box
 GOOD_ENOUGH, LONGER_FOR = 0.01, 1.5  # standard deviation of a speed over itself
@@ -36,6 +37,9 @@ class SpeedSettings(Section):
     min_duration_s: float = Field(0.4, gt=0, le=600, description="s: shortest stretch a speed is measured over")
     min_distance_m: float = Field(2.0, gt=0, le=1000, description="m: shortest way a speed is measured over")
     max_sigma: float = Field(0.15, gt=0, le=10, description="standard deviation over speed: above, too uncertain")
+    max_noise: float = Field(
+        0.03, gt=0, le=10, description="the same without what the calibration adds, of what is faster than 6 m/s"
+    )
     max_acceleration: float = Field(9.0, gt=0, le=100, description="m/s^2: above, the track has jumped")
     min_evidence: float = Field(
         3.55,
@@ -43,7 +47,7 @@ class SpeedSettings(Section):
         le=6,
         description="share of its outline that was found, plus 2.5 times the share that does not lie in the midst of "
         "others, plus 0.9 times the share of its area that is neither shadow nor empty road, plus 0.18 times the "
-        "logarithm of the time it was seen over 2 s",
+        "logarithm of the time it was seen over 2 s; less 0.2 for what is long and narrower than a metre",
     )
     min_measured: float = Field(0.6, ge=0, le=1, description="share of a track's frames that must be measured")
     max_misfit: float = Field(0.2, gt=0, le=5, description="outline misfit over outline size: above, no such box")
@@ -59,12 +63,16 @@ class SpeedSettings(Section):
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """A stretch [first, last] of a path: mean speed and deviation (m/s), way (m), course (rad), reason or ''."""
+    """A stretch [first, last] of a path: mean speed and deviation (m/s), way (m), course (rad), reason or ''.
+
+    `noise` (m/s) is the deviation without what the calibration adds.
+    """
 
     first: int
     last: int
     speed: float
     sigma: float
+    noise: float
     distance: float
     course: float
     reason: str
@@ -80,20 +88,20 @@ def judge(path: Path, entry_cov: Array, bias_px: float, settings: SpeedSettings,
     position, velocity = path.planar.mean[:, :2], path.planar.mean[:, 2:]
     tangent = _tangents(velocity)
     length = way(position, tangent)
-    first, last, sigma = _best_stretch(path, length, tangent, entry_cov, bias_px, settings)
+    first, last, sigma, noise = _best_stretch(path, length, tangent, entry_cov, bias_px, settings)
     duration = path.t[last] - path.t[first]
     distance = length[last] - length[first]
     speed = distance / duration if duration > 0 else 0.0
     moved = position[last] - position[first]
     course = float(np.arctan2(moved[1], moved[0]))
-    verdict = Verdict(first, last, float(speed), float(sigma), float(distance), course, "")
+    verdict = Verdict(first, last, float(speed), float(sigma), float(noise), float(distance), course, "")
     return replace(verdict, reason=_reason(path, verdict, settings, bool((trusted & path.measured).any())))
 
 
 def _best_stretch(
     path: Path, length: Array, tangent: Array, entry_cov: Array, bias_px: float, settings: SpeedSettings
-) -> tuple[int, int, float]:
-    """First and last state, and the deviation of the mean speed between them (m/s)."""
+) -> tuple[int, int, float, float]:
+    """First and last state, and the deviations of the mean speed between them (m/s), with and without calibration."""
     seen = np.flatnonzero(path.measured) if path.measured.any() else np.arange(len(path.t))
     grid = np.unique(seen[np.linspace(0, len(seen) - 1, min(len(seen), 48)).astype(int)])
     i, j = (index.ravel() for index in np.meshgrid(grid, grid, indexing="ij"))
@@ -126,11 +134,13 @@ def _best_stretch(
     angle = np.unwrap(np.arctan2(tangent[:, 1], tangent[:, 0]))
     turned = (TURN_M * (angle[j] - angle[i])) ** 2
     stamps = 2 * (distance / np.maximum(duration, 1e-9) * settings.sigma_t_s) ** 2
-    sigma_way = np.sqrt(pose + np.clip(calibration, 0, None) + bias + wander + size + turned + stamps)
+    own = pose + bias + wander + size + turned + stamps
+    sigma_way = np.sqrt(own + np.clip(calibration, 0, None))
     doubt = sigma_way / np.maximum(distance, 1e-3)
     good = doubt <= max(LONGER_FOR * float(doubt.min()), GOOD_ENOUGH)
     best = int(np.argmax(np.where(good, distance, -np.inf)))
-    return int(i[best]), int(j[best]), float(sigma_way[best] / max(duration[best], 1e-9))
+    took = max(duration[best], 1e-9)
+    return int(i[best]), int(j[best]), float(sigma_way[best] / took), float(np.sqrt(own[best]) / took)
 
 
 def _tangents(velocity: Array) -> Array:
@@ -178,7 +188,8 @@ def _reason(path: Path, verdict: Verdict, settings: SpeedSettings, trusted: bool
     outline = _outline_px(path)
     if np.isfinite(path.misfit_px) and path.misfit_px > settings.max_misfit * outline + 3:
         return f"no box fits: outline off by {path.misfit_px:.0f} px (several vehicles, a shadow or a reflection)"
-    if verdict.sigma > settings.max_sigma * abs(verdict.speed):
+    too_noisy = verdict.noise > settings.max_noise * max(abs(verdict.speed), STEADY)
+    if too_noisy or verdict.sigma > settings.max_sigma * abs(verdict.speed):
         half = verdict.sigma * Z95 * KMH
         return f"too uncertain: {verdict.speed * KMH:.0f} +- {half:.0f} km/h"
     return ""
