@@ -133,7 +133,8 @@ def test_half_an_outline_is_believed_when_it_was_seen_for_long_and_stands_apart(
     def seen(support, apart, paint, seconds):
         t = np.arange(0, seconds, 1 / FPS)
         known = np.ones(len(t), bool)
-        return evidence(SimpleNamespace(support=support, apart=apart, paint=paint, t=t, measured=known))
+        path = SimpleNamespace(support=support, apart=apart, paint=paint, t=t, measured=known, size=CAR)
+        return evidence(path)
 
     least = SpeedSettings().min_evidence
     assert seen(0.9, 1.0, 0.9, 1.0) > least
