@@ -23,7 +23,7 @@ from visfuse_cli.vision import wireframe
 REACH_PX = (4.0, 20.0)
 PROOF, PROVEN = 10, 0.5  # frames after which a thing that was seen in few of them is none
 AT_ONCE = 5  # frames that are looked at together: what is expected in them differs little
-LOST_S = 0.3  # s without the thing: it was not there before
+LOST_S = 0.5  # s without the thing: it was not there before
 
 Recent = deque[tuple[int, float, Evidence]]  # frame, t and what it showed, oldest first
 
