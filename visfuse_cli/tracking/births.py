@@ -16,7 +16,7 @@ from visfuse_cli.tracking.association import claim, footprint_overlap, region_bo
 from visfuse_cli.tracking.dynamics import Dynamics, Step
 from visfuse_cli.tracking.evidence import Boxes, Evidence, LabelEvidence
 from visfuse_cli.tracking.hypotheses import HEADING_SIGMA, Guess, best_guess
-from visfuse_cli.tracking.joining import part_before
+from visfuse_cli.tracking.joining import part_before, places
 from visfuse_cli.tracking.lookback import Recent, trace
 from visfuse_cli.tracking.scan import headings, scan, velocity_of
 from visfuse_cli.tracking.settings import TrackerSettings
@@ -232,8 +232,7 @@ class Nursery:
     def joined(self, old: Track, new: Track) -> Track:
         """A track with what an older one was before it began."""
         kept = [sample for sample in old.samples if sample.frame < new.samples[0].frame]
-        was = np.stack([step.posterior.mean for step in (*old.steps[: len(kept)], *new.steps)])
-        pose = np.column_stack([was[:, :2], self._dynamics.heading(was)])
+        pose = places([*old.steps[: len(kept)], *new.steps], self._dynamics)
         return self._track(old.id, kept + new.samples, pose, new.traced_from)
 
     def _track(self, identity: int, samples: list[Sample], pose: Array, traced_from: int) -> Track:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from bisect import bisect_left
+from collections.abc import Sequence
 
 import numpy as np
 
 from visfuse_cli.maths.angles import wrap
 from visfuse_cli.records import Array
-from visfuse_cli.tracking.dynamics import Dynamics
+from visfuse_cli.tracking.dynamics import Dynamics, Step
 from visfuse_cli.tracking.targets import Sample, Track
 
 CLOSE_M = 2.0  # between the places that both have for one moment
@@ -28,13 +29,12 @@ def part_before(
 ) -> tuple[list[Sample], Array] | None:
     """The part of an earlier track before a new one's samples with poses (n, 3): empty when the earlier one followed
     the same vehicle wrongly, None when it followed another."""
-    was = np.stack([step.posterior.mean for step in old.steps])
-    place = np.column_stack([was[:, :2], dynamics.heading(was)])
+    place = places(old.steps, dynamics)
     kept = [sample for sample in old.samples if sample.frame < samples[0].frame]
     if len(kept) < len(old.samples):
         fits, one = _while_both(old, place, samples, pose, size)
     else:
-        planar, _ = dynamics.planar(was[-1])
+        planar, _ = dynamics.planar(old.steps[-1].posterior.mean)
         fits = one = _drives_on(old, planar, place[-1, 2], samples[0].t, pose[0], size)
     if not one:
         return None
@@ -47,12 +47,23 @@ def goes_on(old: Track, new: Track, dynamics: Dynamics) -> bool:
     k = bisect_left(old.samples, new.samples[0].frame, key=lambda sample: sample.frame)
     if not 0 < k < len(old.samples):
         return False
-    was, began = old.steps[k].posterior.mean, new.steps[0].posterior.mean
-    heading = float(dynamics.heading(began))
-    turned = abs(wrap(float(dynamics.heading(was)) - heading))
-    (x, y), (c, s) = (was - began)[:2], (np.cos(heading), np.sin(heading))
-    near = abs(c * x + s * y) < PART * (old.size[0] + new.size[0]) and abs(c * y - s * x) < ASIDE_M
-    return bool(near and turned < TURNED and _alike(old.size, new.size) and _good(old.samples[:k]))
+    along, across, turned = _off(places(old.steps[k : k + 1], dynamics), places(new.steps[:1], dynamics))
+    near = (along < PART * (old.size[0] + new.size[0])) & (across < ASIDE_M) & (turned < TURNED)
+    return bool(near[0] and _alike(old.size, new.size) and _good(old.samples[:k]))
+
+
+def places(steps: Sequence[Step], dynamics: Dynamics) -> Array:
+    """Where (n, 3) a target is believed to be, m and rad, after each of its steps."""
+    was = np.stack([step.posterior.mean for step in steps])
+    return np.column_stack([was[:, :2], dynamics.heading(was)])
+
+
+def _off(place: Array, pose: Array) -> tuple[Array, Array, Array]:
+    """How far off (n,) places (n, 3) are from poses (n, 3): m along these and across, and rad turned."""
+    apart = place[:, :2] - pose[:, :2]
+    c, s = np.cos(pose[:, 2]), np.sin(pose[:, 2])
+    along, across = apart[:, 0] * c + apart[:, 1] * s, c * apart[:, 1] - s * apart[:, 0]
+    return np.abs(along), np.abs(across), np.abs(wrap(place[:, 2] - pose[:, 2]))
 
 
 def _while_both(old: Track, place: Array, samples: list[Sample], pose: Array, size: Array) -> tuple[bool, bool]:
@@ -61,14 +72,10 @@ def _while_both(old: Track, place: Array, samples: list[Sample], pose: Array, si
     index = {sample.frame: k for k, sample in enumerate(samples)}
     common = [(k, index[s.frame]) for k, s in enumerate(old.samples) if s.frame in index]
     mine, its = np.array(common).T
-    apart = place[mine, :2] - pose[its, :2]
-    ahead = np.column_stack([np.cos(pose[its, 2]), np.sin(pose[its, 2])])
-    along, across = np.sum(apart * ahead, axis=1), ahead[:, 0] * apart[:, 1] - ahead[:, 1] * apart[:, 0]
-    turned = np.abs(wrap(place[mine, 2] - pose[its, 2]))
-    same = (np.abs(along) < max(CLOSE_M, PART * (size[0] + old.size[0]))) & (turned < TURNED)
-    same &= np.abs(across) < ASIDE_M
+    along, across, turned = _off(place[mine], pose[its])
+    same = (along < max(CLOSE_M, PART * (size[0] + old.size[0]))) & (across < ASIDE_M) & (turned < TURNED)
     # whatever the earlier one did in the end, or was too late to do
-    fits = old.samples[0].frame < samples[0].frame and float(np.hypot(*apart[0])) < CLOSE_M
+    fits = old.samples[0].frame < samples[0].frame and float(np.hypot(along[0], across[0])) < CLOSE_M
     if not fits and lasting(old, samples[0].frame, len(samples)):
         fits = bool(same[0]) and _alike(size, old.size)
         return fits, fits

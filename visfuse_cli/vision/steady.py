@@ -114,7 +114,7 @@ class Steady:
         scale = COARSE_PX / grey.shape[1]
         here, there = (_edges(cv2.resize(each, None, fx=scale, fy=scale)) for each in (self._grey, grey))
         (u, v), _ = cv2.phaseCorrelate(here, there, cv2.createHanningWindow(here.shape[::-1], cv2.CV_32F))
-        return np.array([[1, 0, u / scale], [0, 1, v / scale], [0, 0, 1.0]])
+        return _moving(np.array([u, v]) / scale)
 
 
 def _moving(way: Array) -> Array:
