@@ -1,11 +1,12 @@
 """The search for a box's outline in a picture of labels, against boxes drawn exactly."""
 
+import cv2
 import numpy as np
 import pytest
 from masks import CAR, TRUCK, evidence_of, labels_of, road_camera
 
 from visfuse_cli.tracking import measure
-from visfuse_cli.tracking.evidence import BoxEvidence
+from visfuse_cli.tracking.evidence import BoxEvidence, LabelEvidence
 from visfuse_cli.tracking.settings import PoseSettings
 from visfuse_cli.vision import contour, regions, wireframe
 from visfuse_cli.vision.background import FOREGROUND, SHADOW
@@ -131,3 +132,32 @@ def test_boxes_behind_the_camera_are_nobodys():
         mask = contour.owners(CAMERA, np.stack([behind, front]), np.stack([CAR, CAR]))
     assert np.isnan(wireframe.projected(CAMERA, behind[None], CAR[None])).any()
     assert np.unique(mask).tolist() == [0, 2]
+
+
+def test_a_box_that_is_too_short_is_looked_for_further_out():
+    labels = labels_of(CAMERA, [(POSE, TRUCK)])
+    short = TRUCK - [1.6, 0, 0]
+    pose = POSE - [0.8 * np.cos(POSE[2]), 0.8 * np.sin(POSE[2]), 0]  # its rear is where it should be
+    evidence = evidence_of(CAMERA, labels)
+    alone = evidence.probe(pose[None], short[None], np.array([4.0]), NOBODY)
+    followed = evidence.look(pose[None], short[None], np.array([4.0]))
+    assert followed.outlines.valid.sum() > alone.outlines.valid.sum()
+    np.testing.assert_array_equal(followed.border, alone.border)  # what was not expected there is no border found
+    belief = short, np.array([0.8, 0.1, 0.1])
+    fit = measure.fit_poses(CAMERA, followed.outlines, pose[None], *belief, PoseSettings())
+    assert fit.size[0, 0] > short[0] + 0.6
+
+
+def test_where_it_is_sunny_a_shadow_is_no_end_of_a_vehicle():
+    shade = POSE + [0.5, -0.3, 0.0]
+    labels = labels_of(CAMERA, [(POSE, CAR)], [(shade, CAR)])
+    within = cv2.erode((labels == FOREGROUND).astype(np.uint8), np.ones((15, 15), np.uint8)) > 0
+    labels[within & (np.arange(labels.shape[0]) % 4 > 0)[:, None]] = 0  # grey paint on a grey road
+    apart = POSE + [0.4, -0.25, 0.0]
+    found = []
+    for sunny in (False, True):
+        evidence = LabelEvidence(labels, CAMERA, regions.bands(CAMERA), 0.3, 0.12, 0.5, sunny=sunny)
+        found.append(fitted(evidence.look(apart[None], CAR[None], np.array([24.0])), apart).pose[0, :2])
+    off = np.linalg.norm(np.array(found) - POSE[:2], axis=1)
+    assert off[1] < 0.15
+    assert off[1] < off[0]

@@ -59,10 +59,12 @@ class LabelEvidence:
         smallest_m: float,
         cleaned: Cleaned | None = None,
         corners: Callable[[], Corners] | None = None,
+        sunny: bool = False,
     ) -> None:
         self._labels, self._cleaned, self._corners, self._past = Labels(labels), cleaned, corners, False
         self._owned: tuple[bytes, Image] | None = None  # the boxes asked about last, and whose each pixel is
         self._camera, self._cut = camera, cut
+        self._sunny = sunny  # what is labelled shadow is none but for paint that is exactly as dark
         self._gap, self._speck, self._smallest = gap_m, speck_m, smallest_m
 
     def pack(self) -> None:
@@ -74,7 +76,8 @@ class LabelEvidence:
         return None if self._corners is None else self._corners()
 
     def look(self, pose: Array, size: Array, reach: Array) -> Look:
-        return contour.search([self._among((pose, size))], np.arange(1, len(pose) + 1), self._camera, pose, size, reach)
+        code = np.arange(1, len(pose) + 1)
+        return contour.search([self._among((pose, size))], code, self._camera, pose, size, reach, beyond=True)
 
     def probe(self, pose: Array, size: Array, reach: Array, taken: Boxes) -> Look:
         return contour.search([self._among(taken)], np.zeros(len(pose), int), self._camera, pose, size, reach)
@@ -93,10 +96,10 @@ class LabelEvidence:
         """What is seen among boxes; the present frame is asked again and again about the same ones."""
         key = boxes[0].tobytes() + boxes[1].tobytes()
         if self._past:
-            return Sight(self._labels, contour.owners(self._camera, *boxes))
+            return Sight(self._labels, contour.owners(self._camera, *boxes), self._sunny)
         if self._owned is None or self._owned[0] != key:
             self._owned = key, contour.owners(self._camera, *boxes)
-        return Sight(self._labels, self._owned[1])
+        return Sight(self._labels, self._owned[1], self._sunny)
 
     def fill(self, pose: Array, size: Array, taken: Boxes) -> Fill:
         """A quick look at each of N boxes as if it alone stood among those `taken`."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Literal, Protocol
 
 import cv2
@@ -22,6 +23,7 @@ from visfuse_cli.tracking.zones import Region
 from visfuse_cli.vision import contour, wireframe
 from visfuse_cli.vision import regions as region_tools
 from visfuse_cli.vision.background import FOREGROUND, Background
+from visfuse_cli.vision.cast_shadows import Darkness, lightness, without_soft_shadows
 from visfuse_cli.vision.points import Corners, MovingPoints
 from visfuse_cli.vision.regions import Cleaned
 from visfuse_cli.vision.steady import moved
@@ -67,11 +69,19 @@ class Detector(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class _Seen:
-    """A frame against the background: its labels (H, W), all of them and those watched, and these cleaned."""
+    """A frame against the background (H, W): in grey, and how light it is.
 
+    raw: its labels; hard: without shadows that fade into the ground; labels: what is thought of them; cleaned: these
+    without specks; sunny: whether shadows are told by their darkness.
+    """
+
+    grey: Image
+    light: Image
     raw: Image
+    hard: Image
     labels: Image
     cleaned: Cleaned
+    sunny: bool
 
 
 _Foreseen = tuple[Callable[[], _Seen], Callable[[], Corners] | None]  # what a frame shows and its corners, once asked
@@ -105,33 +115,39 @@ class MovingRegions:
         self._sun, self._shade = Sun(camera), Shade(background.shadow_ratio)
         self._foreseen: deque[_Foreseen] = deque()
         self._learning: deque[Callable[[], Image]] = deque()
-        self._raw = self._labels = np.zeros((0, 0), np.uint8)
+        self._darkness = Darkness()
+        self._seen: _Seen | None = None  # the frame that evidence was given of
+        self._labels = np.zeros((0, 0), np.uint8)
 
     def foresee(self, frame: Frame) -> None:
         seen, corners = self._compare(lambda: self._see(frame.image)), self._corners
         if corners is None:
             self._foreseen.append((seen, None))
         else:
-            followed = self._follow(lambda: corners.follow(grey_of(frame.image), frame.t, paint_of(seen().labels)))
+            followed = self._follow(lambda: corners.follow(seen().grey, frame.t, paint_of(seen().labels)))
             self._foreseen.append((seen, followed))
 
     def _see(self, image: Image) -> _Seen:
-        raw = labels = self._background.detect(image)
+        raw = self._background.detect(image)
+        grey = grey_of(image)
+        light = lightness(grey, grey_of(self._background.picture))
+        hard = without_soft_shadows(raw, light)
+        labels = self._darkness.told(hard, light)
         if self._watched is not None:
             labels = np.asarray(cv2.bitwise_and(labels, self._watched), dtype=np.uint8)
-        return _Seen(raw, labels, self._clean(labels))
+        return _Seen(grey, light, raw, hard, labels, self._clean(labels), self._darkness.known)
 
     def evidence(self, frame: Frame, expected: Boxes) -> Evidence:
         awaited, corners = self._foreseen.popleft()
         seen = awaited()
-        self._raw, labels, cleaned = seen.raw, seen.labels, seen.cleaned
+        self._seen, labels, cleaned = seen, seen.labels, seen.cleaned
         if self._sun.shadow is not None and self._shade.needed and len(expected[0]):
             where = shadow_picture(self._camera, *expected, self._sun.shadow.per_metre)
             labels = self._shade.cut(labels, frame.image, self._empty, where)
             if labels is not seen.labels:
                 cleaned = self._clean(labels)
         self._labels = labels
-        return LabelEvidence(labels, self._camera, self._bands, *self._cleaning, cleaned, corners)
+        return LabelEvidence(labels, self._camera, self._bands, *self._cleaning, cleaned, corners, seen.sunny)
 
     def _clean(self, labels: Image) -> Cleaned:
         return region_tools.cleaned(labels, self._bands, self._cleaning[1])
@@ -140,13 +156,15 @@ class MovingRegions:
         pose, size = tracker.boxes()
         settled = np.array([len(t.samples) >= SETTLED and t.samples[-1].measured for t in tracker.tracks], dtype=bool)
         self._sun.look(frame.t, self._labels, pose, size, settled, [track.id for track in tracker.tracks])
-        followed, raw = self._outlines(pose, size), self._raw
-        self._learning.append(self._compare(lambda: self._learnt(frame, followed, raw)))
+        followed, seen = partial(self._outlines, pose, size), self._seen
+        assert seen is not None
+        self._learning.append(self._compare(lambda: self._learnt(frame, followed, seen)))
         if len(self._learning) > LEARNING:
             self._empty = self._learning.popleft()()
 
-    def _learnt(self, frame: Frame, followed: Iterator[Array], raw: Image) -> Image:
-        self._background.learn(frame.image, frame.t, followed, raw)
+    def _learnt(self, frame: Frame, followed: Callable[[], Iterator[Array]], seen: _Seen) -> Image:
+        self._background.learn(frame.image, frame.t, followed(), seen.raw)
+        self._darkness.learn(seen.hard, seen.light, followed())
         return self._background.picture
 
     def _outlines(self, pose: Array, size: Array) -> Iterator[Array]:

@@ -8,7 +8,7 @@ that touches it or a shadow beside it do not move the outline (Lou 2002, sec. 2:
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -27,6 +27,7 @@ CLEAR_PX = 2.5  # between a border and the background outside it
 SOLID = 0.8  # of what lies inside a border must be paint to take what lies outside for shadow
 GROUND_EDGES = 4  # the first of the EDGES lie on the ground
 OPEN = 0.7  # of a profile that must be visible to expect a border in it
+BEYOND = 0.12  # of a silhouette's width: how far out the border of a box that is too small may lie
 LEAST = 0.1  # of a border or an area that must be visible to say anything about it
 OUTSIDE, OUTSIDE_PX = 0.06, (2.5, 10.0)  # of a silhouette's width, px: what lies so far outside of it is around it
 _RADII = np.sqrt((np.arange(5) + 0.5) / 5)  # from the middle of a silhouette to its border: equal areas
@@ -92,10 +93,12 @@ class Look:
 
 @dataclass(frozen=True, slots=True)
 class Sight:
-    """One picture's labels, and whose silhouette is nearest in each pixel (H, W) (see `owners`)."""
+    """One picture's labels, whose silhouette is nearest in each pixel (H, W) (see `owners`), and whether it is sunny:
+    shadows are then told by their darkness."""
 
     labels: Labels
     owner: Image
+    sunny: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,6 +138,7 @@ def profiles(
     nearest = np.where(nearer, found[1], found[0])
     ground = edge < GROUND_EDGES
     under = _stands_in_shadow(paint, known, offset, found, ground)
+    under |= np.array([[sight.sunny] for sight in sights]) & np.isfinite(found[0])
     nearest = np.where(under, found[0], nearest)
     valid = np.isfinite(nearest)
     support = _dot(normal, at) + np.where(valid, nearest, 0.0)
@@ -145,21 +149,35 @@ def profiles(
 
 
 def search(
-    sights: Sequence[Sight], code: NDArray[np.intp], camera: GroundCamera, pose: Array, size: Array, reach: Array
+    sights: Sequence[Sight],
+    code: NDArray[np.intp],
+    camera: GroundCamera,
+    pose: Array,
+    size: Array,
+    reach: Array,
+    beyond: bool = False,
 ) -> Look:
-    """What is seen of N boxes: outlines as in `profiles`, and how much of border and area is as it was expected."""
+    """What is seen of N boxes: outlines as in `profiles`, and how much of border and area is as it was expected.
+
+    With `beyond` a border in the midst of paint that is no other box's is looked for further out, as the box is too
+    small.
+    """
     across = profiles(sights, code, camera, pose, size, reach)
     valid, ground = across.outlines.valid, across.ground
     seen = np.count_nonzero(across.known, axis=2)
     in_view = seen / across.known.shape[2] > OPEN
     amidst = np.count_nonzero(across.paint, axis=2) > SOLID * seen  # nothing but paint: another vehicle is beside it
     told = in_view & (valid | ~amidst)
+    outlines = across.outlines
+    if beyond:
+        missing = in_view & ~valid & amidst
+        outlines = _beyond(outlines, missing, sights, code, camera, pose, size, reach)
     label, whose, inside = _look(sights, camera, _spokes(across.middle, across.at, _RADII))
     own = inside & (whose == code[:, None, None])
     area = _areas(across.middle, across.at, across.normal)[..., None] * np.ones(len(_RADII))
     area /= np.maximum(area.sum(axis=(1, 2), keepdims=True), 1e-9)
     return Look(
-        across.outlines,
+        outlines,
         border=_share(valid & in_view, in_view, 1 / DIRECTIONS),
         likeness=_share(valid & in_view, told, 1 / DIRECTIONS),
         clear=_share(across.clear, valid, 1 / DIRECTIONS),
@@ -168,6 +186,30 @@ def search(
         paint=_share(own & (label == FOREGROUND), own, area),
         open=np.sum(own * area, axis=(1, 2)),
     )
+
+
+def _beyond(
+    outlines: Outlines,
+    missing: NDArray[np.bool_],
+    sights: Sequence[Sight],
+    code: NDArray[np.intp],
+    camera: GroundCamera,
+    pose: Array,
+    size: Array,
+    reach: Array,
+) -> Outlines:
+    """N outlines with the rows that are `missing` (N, K) where they are found further out."""
+    far = BEYOND * outlines.width
+    which = np.flatnonzero(missing.any(axis=1) & (far > reach))
+    if not len(which):
+        return outlines
+    seen = sights if len(sights) == 1 else [sights[k] for k in which.tolist()]
+    wide = profiles(seen, code[which], camera, pose[which], size[which], far[which])
+    found = wide.outlines.valid & missing[which]
+    support, valid = outlines.support.copy(), outlines.valid.copy()
+    support[which] = np.where(found, wide.outlines.support, support[which])
+    valid[which] |= found
+    return replace(outlines, support=support, valid=valid)
 
 
 @dataclass(frozen=True, slots=True)
