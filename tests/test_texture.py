@@ -2,13 +2,14 @@
 
 import numpy as np
 import pytest
-from masks import CAR, TRUCK, road_camera
+from masks import CAR, TRUCK, evidence_of, labels_of, road_camera
 
 from visfuse_cli.maths.cameras import project
 from visfuse_cli.tracking import dynamics as dynamics_tools
 from visfuse_cli.tracking import texture
+from visfuse_cli.tracking.ground import GroundTracker
 from visfuse_cli.tracking.joining import goes_on, part_before
-from visfuse_cli.tracking.settings import VEHICLES, FilterSettings, TargetSettings
+from visfuse_cli.tracking.settings import VEHICLES, FilterSettings, TargetSettings, TrackerSettings
 from visfuse_cli.tracking.targets import Sample, Track
 from visfuse_cli.vision.points import Moves
 from visfuse_cli.vision.wireframe import tangents
@@ -128,3 +129,24 @@ def test_a_track_beside_another_is_another_vehicle():
     dynamics, old = track_along(1, range(50), straight(range(50)))
     _, young = track_along(2, range(28, 60), straight(range(28, 60), x=3.5))
     assert part_before(old, dynamics, young.samples, straight(range(28, 60), x=3.5), CAR) is None
+
+
+def test_what_comes_the_other_way_where_a_track_ends_is_another_vehicle():
+    dynamics, old = track_along(1, range(50), straight(range(50)))
+    back = np.array([[0.0, 20 + 0.2 * (99 - frame), -np.pi / 2] for frame in range(50, 90)])
+    _, young = track_along(2, range(50, 90), back)
+    assert part_before(old, dynamics, young.samples, back, CAR) is None
+
+
+def test_nothing_drives_backwards_at_speed():
+    truth = straight(range(60))
+    truth[30:, 1] = truth[30, 1] - 0.6 * np.arange(30)  # 15 m/s, the other way
+    dynamics, old = track_along(1, range(30), truth[:30])
+    camera = road_camera()
+    tracker = GroundTracker(camera, TrackerSettings(target=TargetSettings(classes=VEHICLES)))
+    tracker.tracks = [old]
+    for frame in range(30, 60):
+        tracker.predict(frame / 25)
+        tracker.update(frame, evidence_of(camera, labels_of(camera, [(truth[frame], CAR)])))
+    mine = [track for track in tracker.tracks if track.id == 1]
+    assert all(dynamics.planar(track.steps[-1].posterior.mean)[0][3] > -6.5 for track in mine)

@@ -20,7 +20,7 @@ from visfuse_cli.tracking.joining import part_before, places
 from visfuse_cli.tracking.lookback import Recent, trace
 from visfuse_cli.tracking.scan import headings, scan, velocity_of
 from visfuse_cli.tracking.settings import TrackerSettings
-from visfuse_cli.tracking.targets import Abandoned, Sample, Track
+from visfuse_cli.tracking.targets import Abandoned, Sample, Track, velocity_at_start
 from visfuse_cli.vision import wireframe
 from visfuse_cli.vision.points import Courses
 from visfuse_cli.vision.wireframe import DIRECTIONS, Outlines
@@ -240,12 +240,14 @@ class Nursery:
         camera, settings = self._camera, self._settings
         used = np.array([sample.measured for sample in samples], dtype=bool)
         outlines = Outlines.stack([sample.outline for sample in samples])
-        sized = measure.classify(camera, outlines[used], pose[used], settings.target.classes, settings.pose)[0]
-        fit = measure.fit_poses(camera, outlines, pose, sized.size, np.full(3, 0.05), settings.pose, HEADING_SIGMA)
+        classes = settings.target.classes
+        tried = measure.classify(camera, outlines[used], pose[used], classes, settings.pose, measure.median_size)
+        size, size_sigma = measure.believed(tried)
+        fit = measure.fit_poses(camera, outlines, pose, size, np.full(3, 0.05), settings.pose, HEADING_SIGMA)
         first = velocity_at_start(samples, pose)
-        steps = self._replay(samples, fit, pose, first, sized.size)
+        steps = self._replay(samples, fit, pose, first, size)
         last = samples[int(np.flatnonzero(used)[-1])].t
-        return Track(identity, sized.prior, sized.size, sized.size_sigma, samples, steps, last, traced_from=traced_from)
+        return Track(identity, tried[0].prior, size, size_sigma, samples, steps, last, traced_from=traced_from)
 
     def _course(self, candidate: Candidate) -> Array | None:
         """Velocity (2,) m/s of a region's foot, once it is known."""
@@ -291,12 +293,6 @@ def _added(track: Track, tracks: list[Track], held: list[Track], next_id: int) -
 def _seen(track: Track) -> float:
     """How much of a track's border was seen, on average."""
     return float(np.mean([sample.border for sample in track.samples if sample.border >= 0]))
-
-
-def velocity_at_start(samples: list[Sample], pose: Array) -> Array:
-    """Velocity (2,) m/s over the first second of a path (n, 3)."""
-    end = max(1, sum(sample.t - samples[0].t < 1.0 for sample in samples) - 1)
-    return np.asarray((pose[end, :2] - pose[0, :2]) / (samples[end].t - samples[0].t))
 
 
 def _abandoned(candidate: Candidate, reason: str) -> Abandoned:

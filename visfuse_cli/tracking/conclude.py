@@ -160,7 +160,8 @@ def _fitted(
     pose = np.column_stack([rough[:, :2], heading])
     outlines = Outlines.stack([sample.outline for sample in track.samples])
     used = np.array([sample.measured for sample in track.samples])
-    sized = measure.classify(camera, outlines[used], pose[used], settings.target.classes, settings.pose)[0]
+    classes = settings.target.classes
+    sized = measure.classify(camera, outlines[used], pose[used], classes, settings.pose, measure.pooled_size)[0]
     return sized, pose, measure.fit_poses(camera, outlines, pose, sized.size, np.full(3, 0.01), settings.pose)
 
 

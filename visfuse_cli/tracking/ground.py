@@ -32,6 +32,7 @@ from visfuse_cli.vision import wireframe
 
 VAGUE_M = 1.5  # m: a pose less certain than this is no measurement
 YOUNG, LEAP = 12, 4.0  # frames after which one measurement may not change the velocity by more (m/s)
+REVERSES = 6.0  # m/s: what goes backwards faster is something else, which came the other way
 SEEN_SHARE = 0.4  # of the unhidden area of a box that must have moved and of its border that must be found
 LIKENESS_S = 0.4  # s over which the share of the border that is found is averaged
 DOUBTFUL, MOVED_M = 0.25, 2.0  # share of the border that is not clear, to compare, and again so many m further
@@ -274,26 +275,26 @@ class GroundTracker:
         return np.clip(reach, REACH_PX[0], np.maximum(REACH_PX[1], REACH_SHARE * upright))
 
     def _plausible(self, track: Track, step: Step, z: Array, R: Array) -> bool:
-        """Enough outline to place the box, inside the gate, and no leap of speed."""
+        """Enough outline to place the box, inside the gate, no leap of speed and no driving backwards at speed."""
         if R[0, 0] + R[1, 1] > VAGUE_M**2:
             return False
         H = self.dynamics.H
         gamma = dynamics_tools.residual(self.dynamics, z, step.prior.mean)
         if mahalanobis(gamma, H @ step.prior.cov @ H.T + R) > self._gate:
             return False
-        if len(track.samples) < YOUNG:
-            return True
         before, after = self.dynamics.planar(np.stack([step.prior.mean, step.posterior.mean]))[0][:, 2:]
-        return float(np.hypot(*(after - before))) < LEAP
+        heading = float(self.dynamics.heading(step.posterior.mean))
+        if after @ [np.cos(heading), np.sin(heading)] < -REVERSES:
+            return False
+        return len(track.samples) < YOUNG or float(np.hypot(*(after - before))) < LEAP
 
     def _learn_size(self, track: Track, fit: wireframe.BoxFit, k: int) -> None:
         # Frames of one target share their errors (the same light, the same shadow): each counts as a tenth.
-        variance = np.diagonal(fit.cov[k, 3:, 3:])
-        noise = 10 / np.clip(1 / variance - 1 / track.size_sigma**2, 1e-6, None)
-        alone = track.size + (fit.size[k] - track.size) / np.clip(1 - variance / track.size_sigma**2, 0.05, 1)
-        gain = track.size_sigma**2 / (track.size_sigma**2 + noise)
-        track.size = np.maximum(track.size + gain * np.clip(alone - track.size, -0.5, 0.5), 0.2)
-        track.size_sigma = np.maximum(track.size_sigma * np.sqrt(1 - gain), 0.03)
+        told, pull = measure.told_of_size(fit[k : k + 1], track.size, track.size_sigma)
+        cov = np.linalg.inv(np.diag(track.size_sigma**-2.0) + told[0] / 10)
+        step = cov @ pull[0] / 10
+        track.size = np.maximum(track.size + np.clip(step, -track.size_sigma, track.size_sigma), 0.2)
+        track.size_sigma = np.maximum(np.sqrt(np.diagonal(cov)), 0.03)
 
     def _end(self) -> list[Track]:
         """Take out and return the tracks that have come to an end."""

@@ -10,7 +10,7 @@ import numpy as np
 from visfuse_cli.maths.angles import wrap
 from visfuse_cli.records import Array
 from visfuse_cli.tracking.dynamics import Dynamics, Step
-from visfuse_cli.tracking.targets import Sample, Track
+from visfuse_cli.tracking.targets import Sample, Track, velocity_at_start
 
 CLOSE_M = 2.0  # between the places that both have for one moment
 DRIFT = 0.2  # m a metre driven unseen: drivers brake and accelerate
@@ -35,7 +35,8 @@ def part_before(
         fits, one = _while_both(old, place, samples, pose, size)
     else:
         planar, _ = dynamics.planar(old.steps[-1].posterior.mean)
-        fits = one = _drives_on(old, planar, place[-1, 2], samples[0].t, pose[0], size)
+        velocity = velocity_at_start(samples, pose)
+        fits = one = _drives_on(old, planar, place[-1, 2], samples[0].t, pose[0], size, velocity)
     if not one:
         return None
     return (kept, place[: len(kept)]) if fits and _good(kept) else ([], np.zeros((0, 3)))
@@ -82,8 +83,9 @@ def _while_both(old: Track, place: Array, samples: list[Sample], pose: Array, si
     return fits, bool(fits or np.mean(same) >= SAME)
 
 
-def _drives_on(old: Track, planar: Array, heading: float, t: float, pose: Array, size: Array) -> bool:
-    """Whether what was last seen with a planar state (4,) and a heading may stand at a pose (3,) at a later t (s)."""
+def _drives_on(old: Track, planar: Array, heading: float, t: float, pose: Array, size: Array, velocity: Array) -> bool:
+    """Whether what was last seen with a planar state (4,) and a heading may stand at a pose (3,) at a later t (s)
+    and go on with a velocity (2,)."""
     gap = t - old.samples[-1].t
     speed = max(float(np.hypot(*planar[2:])), 1e-6)
     slow = speed < SLOW  # what hardly moves goes where it faces
@@ -92,7 +94,8 @@ def _drives_on(old: Track, planar: Array, heading: float, t: float, pose: Array,
     on, off = float(offset @ way), float(way[0] * offset[1] - way[1] * offset[0])
     turn = abs(wrap(pose[2] - np.arctan2(way[1], way[0])))
     reach = CLOSE_M + DRIFT * gap * speed
-    at_once = gap < AT_ONCE_S and float(np.hypot(*offset)) < NEXT * size[0]  # nothing else can be there
+    onward = slow or float(velocity @ way) > -SLOW  # what comes the other way is another
+    at_once = onward and gap < AT_ONCE_S and float(np.hypot(*offset)) < NEXT * size[0]  # nothing else can be there
     near = -reach < on < reach + slow * STARTS * gap**2 / 2 and abs(off) < ASIDE_M and (turn < TURNED or at_once)
     return bool(near and (gap < WAIT_S[0] or (slow and _alike(size, old.size) and gap < WAIT_S[1])))
 

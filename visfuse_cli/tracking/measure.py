@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,6 +14,9 @@ from visfuse_cli.vision import wireframe
 from visfuse_cli.vision.wireframe import BoxFit, Outlines
 
 SLIM, SLIM_M = 0.5, 1.0  # of its length, and m: what is less wide is slim
+FEW = 4.0  # times as much as the best that all outlines of a thing tell at most: they share their errors
+AGREED = 5  # rounds of weighing them
+LEAST_SIGMA = 0.02  # m: no size is known better
 HEADING_SIGMA = 0.25  # rad: prior of a fit around the predicted heading, taken out of the measurement again
 POSITION_SIGMA = 5.0  # m: keeps a half-hidden box from wandering off, without weight in an ordinary fit
 
@@ -65,6 +69,9 @@ def looks_right(fit: BoxFit, outlines: Outlines) -> NDArray[np.bool_]:
     return np.asarray(fit.rms < np.maximum(6.0, 0.15 * outlines.width))
 
 
+CommonSize = Callable[[BoxFit, Array, Array], tuple[Array, Array]]  # fits, prior size and its deviation -> these of all
+
+
 @dataclass(frozen=True, slots=True)
 class Sized:
     """Outlines of one thing seen as a member of a class: its size (3,) and deviation (3,), the fit, the misfit."""
@@ -77,42 +84,73 @@ class Sized:
 
 
 def classify(
-    camera: GroundCamera, outlines: Outlines, pose: Array, classes: tuple[SizePrior, ...], settings: PoseSettings
+    camera: GroundCamera,
+    outlines: Outlines,
+    pose: Array,
+    classes: tuple[SizePrior, ...],
+    settings: PoseSettings,
+    common_size: CommonSize,
 ) -> list[Sized]:
     """N outlines of one thing as a member of each class, the class that explains them best first.
 
-    The frames of one track share their errors, so that they count as few independent ones.
+    The frames of one track share their errors, so that they count as few independent ones. What the outlines do not
+    tell speaks for no class: a narrow one gains nothing where the size is not seen.
     """
     tried = []
     for prior in classes:
         mean, sigma = prior_arrays(prior)
         fit = fit_poses(camera, outlines, pose, mean, sigma, settings, 0.12)
-        size, size_sigma = common_size(fit, mean, sigma)
+        size, size_sigma = common_size(fit[fit.ok], mean, sigma) if fit.ok.any() else (mean, sigma)
         relative = fit.rms / noise_of(outlines, settings)
         misfit = float(np.median(relative[fit.ok])) if fit.ok.any() else np.inf
-        cost = 4 * misfit**2 + float(np.sum(((size - mean) / sigma) ** 2 + 2 * np.log(sigma)))
+        cost = 4 * misfit**2 + float(np.sum(((size - mean) / sigma) ** 2 + 2 * np.log(sigma / size_sigma)))
         tried.append(Sized(prior, size, size_sigma, fit, cost))
     return sorted(tried, key=lambda sized: sized.cost)
 
 
-def common_size(fit: BoxFit, mean: Array, sigma: Array) -> tuple[Array, Array]:
-    """One size (3,) for all fits of a thing: the median weighted by what each fit adds to the prior."""
-    if not fit.ok.any():
-        return mean, sigma
-    variance = np.diagonal(fit.cov[fit.ok, 3:, 3:], axis1=1, axis2=2)
-    gain = np.clip(1 / variance - 1 / sigma**2, 0, None)
-    sizes = fit.size[fit.ok]
+def believed(tried: list[Sized]) -> tuple[Array, Array]:
+    """Size (3,) and deviation (3,) of a thing that is a member of each class as likely as that explains it."""
+    cost = np.array([each.cost for each in tried])
+    share = np.exp(-(cost - cost.min()) / 2)
+    share /= share.sum()
+    size, sigma = (np.array([getattr(each, name) for each in tried]) for name in ("size", "size_sigma"))
+    mean = share @ size
+    return mean, np.sqrt(share @ (sigma**2 + (size - mean) ** 2))
+
+
+def median_size(fit: BoxFit, mean: Array, sigma: Array) -> tuple[Array, Array]:
+    """One size (3,) and its deviation (3,) for the fits of a thing that is new: their median, which a few wrong ones do
+    not move, weighted by what each adds to the prior size and its deviation (3,)."""
+    gain = np.clip(1 / np.diagonal(fit.cov[:, 3:, 3:], axis1=1, axis2=2) - 1 / sigma**2, 0, None)
     size, spread = mean.copy(), sigma.copy()
-    for k in range(3):
-        total = gain[:, k].sum()
-        if total <= 0:
-            continue
-        # A fit's size is pulled to the prior; without the pull it is what the outline alone says.
-        alone = mean[k] + (sizes[:, k] - mean[k]) / np.clip(gain[:, k] * variance[:, k], 0.05, 1)
-        order = np.argsort(alone)
-        middle = np.searchsorted(np.cumsum(gain[order, k]), total / 2)
-        outline_says = alone[order[min(middle, len(order) - 1)]]
-        information = min(total, gain[:, k].max() * 4)
-        size[k] = (outline_says * information + mean[k] / sigma[k] ** 2) / (information + 1 / sigma[k] ** 2)
-        spread[k] = max(0.02, (information + 1 / sigma[k] ** 2) ** -0.5)
+    for k in np.flatnonzero(gain.sum(axis=0) > 0):
+        order = np.argsort(fit.size[:, k])
+        total = np.cumsum(gain[order, k])
+        size[k] = fit.size[order[min(np.searchsorted(total, total[-1] / 2), len(order) - 1)], k]
+        information = min(total[-1], gain[:, k].max() * FEW)
+        spread[k] = max(LEAST_SIGMA, (information + 1 / sigma[k] ** 2) ** -0.5)
     return np.maximum(size, 0.2), spread
+
+
+def pooled_size(fit: BoxFit, mean: Array, sigma: Array) -> tuple[Array, Array]:
+    """One size (3,) and its deviation (3,) for all fits of a thing, whose outlines together outweigh the prior size and
+    its deviation (3,); those that agree least with the others count least."""
+    information, pull = told_of_size(fit, mean, sigma)
+    size, spread, weight = mean, sigma, np.ones(len(pull))
+    worth = np.einsum("nii,i->n", information, sigma**2)
+    for _ in range(AGREED):
+        few = weight * min(1.0, FEW * worth.max() / max(float(worth @ weight), 1e-9))
+        cov = np.linalg.inv(np.diag(sigma**-2.0) + np.einsum("n,nij->ij", few, information))
+        size = mean + cov @ (few @ pull)
+        spread = np.sqrt(np.diagonal(cov))
+        off = pull - information @ (size - mean)
+        weight = 1 / (1 + np.einsum("ni,nij,nj->n", off, fit.cov[:, 3:, 3:], off) / 3)
+    return np.maximum(size, 0.2), np.maximum(spread, LEAST_SIGMA)
+
+
+def told_of_size(fit: BoxFit, size: Array, sigma: Array) -> tuple[Array, Array]:
+    """What N outlines alone say about a size (3,) of deviation `sigma` (3,): information (N, 3, 3), and that times how
+    far off it is (N, 3). Length and height of what is seen from behind are told together."""
+    posterior = np.linalg.inv(fit.cov[:, 3:, 3:])
+    pull = (posterior @ (fit.size - size)[..., None])[..., 0]
+    return np.asarray(posterior - np.diag(sigma**-2.0), dtype=float), np.asarray(pull, dtype=float)

@@ -34,6 +34,12 @@ class Sample:
         return cls(frame, t, look.outlines[k], float(border[k]), measured, float(look.apart[k]), float(look.paint[k]))
 
 
+def velocity_at_start(samples: list[Sample], pose: Array) -> Array:
+    """Velocity (2,) m/s over the first second of a path (n, 3)."""
+    end = max(1, sum(sample.t - samples[0].t < 1.0 for sample in samples) - 1)
+    return np.asarray((pose[end, :2] - pose[0, :2]) / (samples[end].t - samples[0].t))
+
+
 @dataclass(slots=True)
 class Comparison:
     """When (s) a track's box is to be compared with others again, where (2,) m it last was, and the wait (s) after."""
