@@ -40,12 +40,13 @@ def without_soft_shadows(labels: Image, light: Image) -> Image:
     soft = cv2.bitwise_and(shadow, cv2.compare(steps, SOFT, cv2.CMP_LE))
     count, piece = cv2.connectedComponents(soft, connectivity=4, ltype=cv2.CV_32S)
     ground = cv2.dilate(cv2.compare(labels, 0, cv2.CMP_EQ), CROSS)
-    rim = cv2.subtract(soft, cv2.erode(soft, CROSS))
-    around = np.bincount(piece[rim > 0], minlength=count)
-    fading = np.bincount(piece[cv2.bitwise_and(rim, ground) > 0], minlength=count)
-    fades = fading > FADES * around
-    fades[0] = False
-    return np.asarray(np.where(fades[piece], 0, labels), dtype=np.uint8)
+    place = np.flatnonzero(soft > 0)
+    of, outer = piece.ravel()[place], cv2.erode(soft, CROSS).ravel()[place] == 0
+    around = np.bincount(of[outer], minlength=count)
+    fading = np.bincount(of[outer & (ground.ravel()[place] > 0)], minlength=count)
+    left = labels.copy()
+    left.ravel()[place[(fading > FADES * around)[of]]] = 0
+    return left
 
 
 class Darkness:
