@@ -159,8 +159,8 @@ def search(
 ) -> Look:
     """What is seen of N boxes: outlines as in `profiles`, and how much of border and area is as it was expected.
 
-    With `beyond` a border in the midst of paint that is no other box's is looked for further out, as the box is too
-    small.
+    With `beyond`, of boxes in one sight, a border in the midst of paint that is no other box's is looked for further
+    out, as the box is too small.
     """
     across = profiles(sights, code, camera, pose, size, reach)
     valid, ground = across.outlines.valid, across.ground
@@ -170,8 +170,10 @@ def search(
     told = in_view & (valid | ~amidst)
     outlines = across.outlines
     if beyond:
-        missing = in_view & ~valid & amidst
-        outlines = _beyond(outlines, missing, sights, code, camera, pose, size, reach)
+        missing, far = in_view & ~valid & amidst, BEYOND * outlines.width
+        again = np.flatnonzero(missing.any(axis=1) & (far > reach))
+        wide = profiles(sights, code[again], camera, pose[again], size[again], far[again]).outlines
+        outlines = _completed(outlines, again, missing[again], wide)
     label, whose, inside = _look(sights, camera, _spokes(across.middle, across.at, _RADII))
     own = inside & (whose == code[:, None, None])
     area = _areas(across.middle, across.at, across.normal)[..., None] * np.ones(len(_RADII))
@@ -188,26 +190,11 @@ def search(
     )
 
 
-def _beyond(
-    outlines: Outlines,
-    missing: NDArray[np.bool_],
-    sights: Sequence[Sight],
-    code: NDArray[np.intp],
-    camera: GroundCamera,
-    pose: Array,
-    size: Array,
-    reach: Array,
-) -> Outlines:
-    """N outlines with the rows that are `missing` (N, K) where they are found further out."""
-    far = BEYOND * outlines.width
-    which = np.flatnonzero(missing.any(axis=1) & (far > reach))
-    if not len(which):
-        return outlines
-    seen = sights if len(sights) == 1 else [sights[k] for k in which.tolist()]
-    wide = profiles(seen, code[which], camera, pose[which], size[which], far[which])
-    found = wide.outlines.valid & missing[which]
+def _completed(outlines: Outlines, which: NDArray[np.intp], missing: NDArray[np.bool_], wide: Outlines) -> Outlines:
+    """N outlines, `which` (n,) of them with the rows that were `missing` (n, K) from those that reach further out."""
+    found = wide.valid & missing
     support, valid = outlines.support.copy(), outlines.valid.copy()
-    support[which] = np.where(found, wide.outlines.support, support[which])
+    support[which] = np.where(found, wide.support, support[which])
     valid[which] |= found
     return replace(outlines, support=support, valid=valid)
 
