@@ -64,7 +64,7 @@ class LabelEvidence:
         self._labels, self._cleaned, self._corners, self._past = Labels(labels), cleaned, corners, False
         self._owned: tuple[bytes, Image] | None = None  # the boxes asked about last, and whose each pixel is
         self._camera, self._cut = camera, cut
-        self._sunny = sunny  # what is labelled shadow is none but for paint that is exactly as dark
+        self._sunny = sunny  # shadows are told by their darkness: only paint exactly as dark is taken for one
         self._gap, self._speck, self._smallest = gap_m, speck_m, smallest_m
 
     def pack(self) -> None:
