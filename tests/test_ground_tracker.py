@@ -133,15 +133,15 @@ def test_half_an_outline_is_believed_when_it_was_seen_for_long_and_stands_apart(
     def seen(support, apart, paint, seconds):
         t = np.arange(0, seconds, 1 / FPS)
         known = np.ones(len(t), bool)
-        path = SimpleNamespace(support=support, apart=apart, paint=paint, t=t, measured=known, size=CAR)
-        return evidence(path)
+        path = SimpleNamespace(support=support, apart=apart, paint=paint, t=t, measured=known, size=CAR, size_z=1.0)
+        return evidence(path, SimpleNamespace(speed=10.0, noise=0.1))
 
     least = SpeedSettings().min_evidence
     assert seen(0.9, 1.0, 0.9, 1.0) > least
-    assert seen(0.5, 0.92, 0.7, 1.5) < least
-    assert seen(0.5, 0.92, 0.7, 12.0) > least
-    assert seen(0.5, 0.92, 0.2, 12.0) < least
-    assert seen(0.7, 0.7, 0.9, 8.0) < least
+    assert seen(0.5, 0.9, 0.6, 1.5) < least
+    assert seen(0.5, 0.9, 0.6, 12.0) > least
+    assert seen(0.4, 0.85, 0.05, 12.0) < least
+    assert seen(0.6, 0.5, 0.9, 4.0) < least
 
 
 def test_what_never_moves_is_given_up_with_its_place():

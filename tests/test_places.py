@@ -12,7 +12,7 @@ from visfuse_cli.maths.polygons import area, contains, distance, surrounding
 from visfuse_cli.tracking.conclude import conclude
 from visfuse_cli.tracking.ground import GroundTracker
 from visfuse_cli.tracking.settings import TrackerSettings
-from visfuse_cli.tracking.verdict import LIKE_A_PART, SpeedSettings, evidence, judge
+from visfuse_cli.tracking.verdict import LIKE_A_PART, ODD, SpeedSettings, evidence, judge
 from visfuse_cli.tracking.zones import Region, stretch, trusted
 
 CAMERA = road_camera()
@@ -125,29 +125,40 @@ def test_a_track_outside_the_trusted_zone_is_rejected_with_that_reason(passing):
     assert verdicts == ["", "outside the trusted zone"]
 
 
-def test_noise_rejects_where_a_vague_calibration_does_not(passing):
+def test_noise_speaks_against_a_track_and_a_vague_calibration_does_not(passing):
     _, settings, tracker, (track,) = passing
     (path,) = conclude([track], CAMERA, settings, tracker.dynamics)
 
-    def reason(seen, entry_cov):
-        return judge(seen, entry_cov, 1.0, SpeedSettings(), np.ones(len(seen.t), dtype=bool)).reason
+    def judged(seen, entry_cov=CAMERA.ground.cov, least=SpeedSettings().min_evidence):
+        return judge(seen, entry_cov, 1.0, SpeedSettings(min_evidence=least), np.ones(len(seen.t), dtype=bool))
 
     H = CAMERA.ground.ground_from_image
     lengths = np.append(H[:2].ravel(), [0.0, 0.0, 0.0])  # what is all of it wrong when the surveyor's tape is
-    vague = 0.05**2 * np.outer(lengths, lengths)
-    assert reason(path, vague) == ""
-    assert judge(path, vague, 1.0, SpeedSettings(), np.ones(len(path.t), dtype=bool)).sigma > 0.04 * 8.9
+    clear, vague = judged(path), judged(path, 0.05**2 * np.outer(lengths, lengths))
     noisy = replace(path, pose_cov=path.pose_cov + np.diag([1.0, 1.0, 0.0, 0.0]))
-    assert reason(path, CAMERA.ground.cov) == ""
-    assert reason(noisy, CAMERA.ground.cov).startswith("too uncertain")
+    assert clear.reason == vague.reason == ""
+    assert vague.sigma > 0.04 * 8.9
+    well, badly = evidence(path, clear), evidence(noisy, judged(noisy))
+    assert evidence(path, vague) == pytest.approx(well, abs=0.05)
+    assert badly < well - 0.5
+    between = (well + badly) / 2
+    assert judged(path, least=between).reason == ""
+    assert judged(noisy, least=between).reason.startswith("too little seen")
+    wild = replace(path, pose_cov=path.pose_cov + np.diag([16.0, 16.0, 0.0, 0.0]))
+    assert judged(wild).reason.startswith("too uncertain")
 
 
-def test_what_is_slim_must_be_seen_better(passing):
+def test_what_is_slim_must_be_seen_better_and_of_all_else_an_odd_size(passing):
     _, settings, tracker, (track,) = passing
     (path,) = conclude([track], CAMERA, settings, tracker.dynamics)
-    bike, person = (replace(path, size=np.array(size)) for size in ([2.0, 0.7, 1.5], [0.5, 0.5, 1.7]))
-    assert evidence(bike) == pytest.approx(evidence(path) - LIKE_A_PART)
-    assert evidence(person) == evidence(path)
+    verdict = judge(path, CAMERA.ground.cov, 1.0, SpeedSettings(), np.ones(len(path.t), dtype=bool))
+    bike, person = (
+        replace(path, size=np.array(size), size_z=1.0) for size in ([2.0, 0.7, 1.5], [0.5, 0.5, 1.7])
+    )
+    usual = replace(path, size_z=0.0)
+    assert evidence(bike, verdict) == pytest.approx(evidence(usual, verdict) - LIKE_A_PART)
+    assert evidence(person, verdict) == pytest.approx(evidence(usual, verdict) - ODD)
+    assert evidence(replace(bike, size_z=3.0), verdict) == evidence(bike, verdict)
 
 
 @pytest.mark.parametrize("frames", [slice(10, 40), slice(10, 11)], ids=["a stretch", "one frame"])

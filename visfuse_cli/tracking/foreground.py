@@ -131,7 +131,7 @@ class MovingRegions:
         raw = self._background.detect(image)
         grey = grey_of(image)
         light = lightness(grey, grey_of(self._background.picture))
-        hard = without_soft_shadows(raw, light)
+        hard = raw if self._darkness.known else without_soft_shadows(raw, light)
         labels = self._darkness.told(hard, light)
         if self._watched is not None:
             labels = np.asarray(cv2.bitwise_and(labels, self._watched), dtype=np.uint8)

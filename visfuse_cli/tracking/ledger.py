@@ -88,7 +88,7 @@ class Ledger:
             verdict = replace(verdict, reason=REASON)
         displaced: list[int] = []
         if not verdict.reason:
-            better, displaced = self._places.setdefault(of.name, Places()).take(path)
+            better, displaced = self._places.setdefault(of.name, Places()).take(path, verdict)
             verdict = verdict if better is None else replace(verdict, reason=_in_place_of(better))
         self.drawn.setdefault(of.name, []).append((int(path.frame[0]), path.id))
         self._ways[path.id] = thinned(position[verdict.first : verdict.last + 1])

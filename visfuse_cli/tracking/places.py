@@ -9,7 +9,7 @@ import numpy as np
 from visfuse_cli.records import Array
 from visfuse_cli.tracking.association import shared_footprint
 from visfuse_cli.tracking.conclude import Path
-from visfuse_cli.tracking.verdict import evidence
+from visfuse_cli.tracking.verdict import Verdict, evidence
 
 SHARED = 0.15  # of a footprint, in another's: more than boxes err by
 OFTEN, LASTING, LEAST_FRAMES = 1 / 3, 0.15, 5  # of the common frames, of the shorter one's frames, and at least
@@ -26,9 +26,9 @@ class Stand:
     evidence: float
 
     @classmethod
-    def of(cls, path: Path) -> Stand:
+    def of(cls, path: Path, verdict: Verdict) -> Stand:
         pose = np.column_stack([path.planar.mean[:, :2], path.heading])
-        return cls(path.id, path.frame[path.measured], pose[path.measured], path.size, evidence(path))
+        return cls(path.id, path.frame[path.measured], pose[path.measured], path.size, evidence(path, verdict))
 
     def excludes(self, other: Stand) -> bool:
         """Whether the two stood in one place for so long that one of them is no vehicle."""
@@ -46,9 +46,9 @@ class Places:
     def __init__(self) -> None:
         self._stands: list[Stand] = []
 
-    def take(self, path: Path) -> tuple[int | None, list[int]]:
+    def take(self, path: Path, verdict: Verdict) -> tuple[int | None, list[int]]:
         """The track that keeps this one out, if one does; else those that it pushes out."""
-        new = Stand.of(path)
+        new = Stand.of(path, verdict)
         rivals = [stand for stand in self._stands if stand.excludes(new)]
         better = max(rivals, key=lambda stand: stand.evidence, default=new)
         if better.evidence > new.evidence:

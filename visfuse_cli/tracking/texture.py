@@ -7,11 +7,13 @@ import numpy as np
 from visfuse_cli.maths.cameras import project
 from visfuse_cli.maths.percentiles import median
 from visfuse_cli.records import Array, GroundCamera
+from visfuse_cli.vision import wireframe
 from visfuse_cli.vision.points import Moves
 
 LEAST = 3  # corners that tell a speed
 CORNER_PX = 0.3  # noise of a corner from picture to picture
 SURFACE = 0.3  # of a speed: corners lie before or behind the sides of a box, and some stay behind what is fast
+MARGIN_PX, MARGIN = 13.0, 0.12
 SETTLED = 0.1  # m/s: what stands may seem to go
 
 
@@ -35,6 +37,7 @@ def paces(camera: GroundCamera, pose: Array, size: Array, expected: Array, moves
     aside = ahead[:, 0] * gone[:, 1] - ahead[:, 1] * gone[:, 0]
     noise = CORNER_PX * np.linalg.norm(np.einsum("ni,nij->nj", ahead, way_of), axis=1)
     good = (owner >= 0) & (np.abs(aside) < np.abs(along) + 3 * noise)
+    good &= _depth_inside(camera, pose, size, moves.now, owner)
     for k in range(len(pose)):
         mine = good & (owner == k)
         if np.count_nonzero(mine) < LEAST:
@@ -46,6 +49,20 @@ def paces(camera: GroundCamera, pose: Array, size: Array, expected: Array, moves
         surface = SURFACE * max(abs(middle), abs(expected[k]))
         speed[k], sigma[k] = middle, np.sqrt(doubt**2 + surface**2 + SETTLED**2)
     return speed, sigma
+
+
+def _depth_inside(camera: GroundCamera, pose: Array, size: Array, pixels: Array, owner: Array) -> Array:
+    """Which of the corners at pixels (n, 2) lie so far inside of their box's outline that they are its own."""
+    inside = np.zeros(len(pixels), dtype=bool)
+    for k in np.unique(owner[owner >= 0]):
+        hull = wireframe.silhouette(camera, pose[k], size[k])
+        if not len(hull):
+            continue
+        along = np.roll(hull, -1, axis=0) - hull
+        normal = np.column_stack([-along[:, 1], along[:, 0]]) / np.linalg.norm(along, axis=1)[:, None]
+        depth = np.abs(((pixels[owner == k][:, None] - hull) * normal).sum(axis=2)).min(axis=1)
+        inside[owner == k] = depth > min(MARGIN_PX, MARGIN * np.ptp(hull[:, 0]))
+    return inside
 
 
 def _inverse(J: Array) -> Array:

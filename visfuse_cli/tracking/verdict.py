@@ -17,17 +17,17 @@ from visfuse_cli.tracking.measure import is_slim
 
 Z95 = 1.959964
 STANDS = 0.3  # m/s
-STEADY = 6.0  # m/s: of what is slower a share of the speed is too little to ask for
 TURN_M = 0.25  # m a radian: the middle of a fitted box shifts as the vehicle shows another side
-SIZE_DOUBT = 0.03  # of a size: no vehicle is quite a box
+SIZE_DOUBT = 0.05  # of a size: no vehicle is quite a box
 GOOD_ENOUGH, LONGER_FOR = 0.01, 1.5  # standard deviation of a speed over itself
 DOUBTFUL_ENDS, SHORT_S = ("jumped", "no longer looks like itself"), 1.0  # s: a track that does so sooner is nothing
-APART, SOLID, LASTING, SHORT_LOOK_S = 2.5, 0.9, 0.18, 2.0  # a logistic fit to traffic, true tracks against false ones
-LIKE_A_PART = 0.2  # what it takes off that a slim thing looks like parts of others
+APART, SOLID, LASTING, EXACT, ODD = 3.0, 1.9, 0.75, 0.5, 0.42  # a logistic fit to traffic, true tracks against false
+SHORT_LOOK_S, USUAL_NOISE, SLOW = 2.0, 0.01, 1.5  # s; of a speed; m/s: of what is slower no share of its speed is asked
+LIKE_A_PART = 0.7  # what it takes off that a slim thing looks like parts of others, whatever its size
 UNSEEN_S = 1.5  # s: a stretch goes over no longer gap
 JUMP_S = 0.3  # s a change of speed is looked at
-SUDDEN = 1.5  # times as much as it is counts what a vehicle gains: it cannot as fast as it brakes
-WANDER_PX, WANDER_S = 0.3, 2.0  # px by which outlines lie off, and s for which they do: noise that frames share
+SUDDEN = 2.5  # times as much as it is counts what a vehicle gains: it cannot as fast as it brakes
+WANDER_PX, WANDER_S = 0.6, 2.0  # px by which outlines lie off, and s for which they do: noise that frames share
 
 
 class SpeedSettings(Section):
@@ -37,17 +37,15 @@ class SpeedSettings(Section):
     min_duration_s: float = Field(0.4, gt=0, le=600, description="s: shortest stretch a speed is measured over")
     min_distance_m: float = Field(2.0, gt=0, le=1000, description="m: shortest way a speed is measured over")
     max_sigma: float = Field(0.15, gt=0, le=10, description="standard deviation over speed: above, too uncertain")
-    max_noise: float = Field(
-        0.03, gt=0, le=10, description="the same without what the calibration adds, of what is faster than 6 m/s"
-    )
     max_acceleration: float = Field(9.0, gt=0, le=100, description="m/s^2: above, the track has jumped")
     min_evidence: float = Field(
-        3.55,
+        4.1,
         ge=0,
-        le=6,
-        description="share of its outline that was found, plus 2.5 times the share that does not lie in the midst of "
-        "others, plus 0.9 times the share of its area that is neither shadow nor empty road, plus 0.18 times the "
-        "logarithm of the time it was seen over 2 s; less 0.2 for what is long and narrower than a metre",
+        le=10,
+        description="share of its outline that was found, plus 3 times the share that does not lie in the midst of "
+        "others, plus 1.9 times the share of its area that is neither shadow nor empty road, plus 0.75 times the "
+        "logarithm of the time it was seen over 2 s, less 0.5 times that of its speed's noise over 1 % of it, less "
+        "0.42 for each deviation of its size from its class, or 0.7 for what is long and narrower than a metre",
     )
     min_measured: float = Field(0.6, ge=0, le=1, description="share of a track's frames that must be measured")
     max_misfit: float = Field(0.2, gt=0, le=5, description="outline misfit over outline size: above, no such box")
@@ -180,7 +178,7 @@ def _reason(path: Path, verdict: Verdict, settings: SpeedSettings, trusted: bool
     if path.size_z > settings.max_size_z:
         length, width, height = path.size
         return f"no {path.class_name} measures {length:.1f} x {width:.1f} x {height:.1f} m: a part, or several"
-    if evidence(path) < settings.min_evidence:
+    if evidence(path, verdict) < settings.min_evidence:
         found, free, filled = (f"{100 * share:.0f} %" for share in (path.support, path.apart, path.paint))
         return (
             f"too little seen: {found} of a {path.class_name}'s outline ({free} free of others), {filled} of its area"
@@ -188,18 +186,20 @@ def _reason(path: Path, verdict: Verdict, settings: SpeedSettings, trusted: bool
     outline = _outline_px(path)
     if np.isfinite(path.misfit_px) and path.misfit_px > settings.max_misfit * outline + 3:
         return f"no box fits: outline off by {path.misfit_px:.0f} px (several vehicles, a shadow or a reflection)"
-    too_noisy = verdict.noise > settings.max_noise * max(abs(verdict.speed), STEADY)
-    if too_noisy or verdict.sigma > settings.max_sigma * abs(verdict.speed):
+    if verdict.sigma > settings.max_sigma * abs(verdict.speed):
         half = verdict.sigma * Z95 * KMH
         return f"too uncertain: {verdict.speed * KMH:.0f} +- {half:.0f} km/h"
     return ""
 
 
-def evidence(path: Path) -> float:
-    """How much speaks for a track: its outline, apart from others, filled, and the time for which it was seen."""
-    seen = path.measured.mean() * (path.t[-1] - path.t[0])
+def evidence(path: Path, verdict: Verdict) -> float:
+    """How much speaks for a track: its outline, apart from others and filled, how long it was seen, how exact its speed
+    is and how usual its size."""
+    seen = max(path.measured.mean() * (path.t[-1] - path.t[0]), SHORT_LOOK_S)
+    noise = max(verdict.noise, 1e-9) / max(verdict.speed, SLOW)
+    odd = LIKE_A_PART if is_slim(path.size) else ODD * path.size_z
     shown = path.support + APART * path.apart + SOLID * path.paint
-    return float(shown - LIKE_A_PART * is_slim(path.size) + LASTING * np.log(max(seen, SHORT_LOOK_S) / SHORT_LOOK_S))
+    return float(shown + LASTING * np.log(seen / SHORT_LOOK_S) - EXACT * np.log(noise / USUAL_NOISE) - odd)
 
 
 def _jumps(path: Path) -> Array:

@@ -39,7 +39,9 @@ def without_soft_shadows(labels: Image, light: Image) -> Image:
     steps = cv2.morphologyEx(light, cv2.MORPH_GRADIENT, SQUARE)
     soft = cv2.bitwise_and(shadow, cv2.compare(steps, SOFT, cv2.CMP_LE))
     count, piece = cv2.connectedComponents(soft, connectivity=4, ltype=cv2.CV_32S)
-    ground = cv2.dilate(cv2.compare(labels, 0, cv2.CMP_EQ), CROSS)
+    outlines, _ = cv2.findContours(cv2.min(labels, 1), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    inside = cv2.drawContours(np.zeros_like(labels), outlines, -1, 255, cv2.FILLED)  # a hole in a body is no ground
+    ground = cv2.dilate(cv2.bitwise_not(inside), CROSS)
     place = np.flatnonzero(soft > 0)
     of, outer = piece.ravel()[place], cv2.erode(soft, CROSS).ravel()[place] == 0
     around = np.bincount(of[outer], minlength=count)
