@@ -152,9 +152,7 @@ def test_what_is_slim_must_be_seen_better_and_of_all_else_an_odd_size(passing):
     _, settings, tracker, (track,) = passing
     (path,) = conclude([track], CAMERA, settings, tracker.dynamics)
     verdict = judge(path, CAMERA.ground.cov, 1.0, SpeedSettings(), np.ones(len(path.t), dtype=bool))
-    bike, person = (
-        replace(path, size=np.array(size), size_z=1.0) for size in ([2.0, 0.7, 1.5], [0.5, 0.5, 1.7])
-    )
+    bike, person = (replace(path, size=np.array(size), size_z=1.0) for size in ([2.0, 0.7, 1.5], [0.5, 0.5, 1.7]))
     usual = replace(path, size_z=0.0)
     assert evidence(bike, verdict) == pytest.approx(evidence(usual, verdict) - LIKE_A_PART)
     assert evidence(person, verdict) == pytest.approx(evidence(usual, verdict) - ODD)

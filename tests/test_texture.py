@@ -12,7 +12,7 @@ from visfuse_cli.tracking.joining import goes_on, part_before
 from visfuse_cli.tracking.settings import VEHICLES, FilterSettings, TargetSettings, TrackerSettings
 from visfuse_cli.tracking.targets import Sample, Track
 from visfuse_cli.vision.points import Moves
-from visfuse_cli.vision.wireframe import tangents
+from visfuse_cli.vision.wireframe import silhouette, tangents
 
 CAMERA = road_camera()
 DT = 0.04
@@ -50,6 +50,18 @@ def test_a_box_turned_wrongly_and_a_few_corners_that_stand_do_little_harm():
     moves.before[:3] = moves.now[:3]
     pace, _ = texture.paces(CAMERA, pose + [0.0, 0.0, 0.4], CAR[None], np.full(1, 6.0), moves)
     assert pace[0] == pytest.approx(6.0 * np.cos(0.4), rel=0.1)
+
+
+def test_corners_where_a_box_meets_what_stands_do_not_hold_it_back():
+    pose = np.array([[1.0, 16.0, np.pi / 2]])
+    moves = moves_of(on_near_side(pose[0], TRUCK, np.random.default_rng(5)), np.array([0.0, 5.0]))
+    hull = silhouette(CAMERA, pose[0], TRUCK)
+    border = hull + 0.02 * (hull.mean(axis=0) - hull)
+    border = np.concatenate([border + share * (np.roll(border, 1, axis=0) - border) for share in (0.0, 0.3, 0.6)])
+    both = Moves(np.concatenate([moves.before, border]), np.concatenate([moves.now, border]), DT)
+    assert len(border) > len(moves.now)
+    pace, _ = texture.paces(CAMERA, pose, TRUCK[None], np.full(1, 5.0), both)
+    assert pace[0] == pytest.approx(5.0, abs=0.1)
 
 
 def test_corners_belong_to_the_box_in_front_and_few_tell_nothing():

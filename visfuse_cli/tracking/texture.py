@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from visfuse_cli.maths.cameras import project
 from visfuse_cli.maths.percentiles import median
 from visfuse_cli.records import Array, GroundCamera
 from visfuse_cli.vision import wireframe
-from visfuse_cli.vision.points import Moves
+from visfuse_cli.vision.points import Moves, window_px
 
 LEAST = 3  # corners that tell a speed
 CORNER_PX = 0.3  # noise of a corner from picture to picture
 SURFACE = 0.3  # of a speed: corners lie before or behind the sides of a box, and some stay behind what is fast
-MARGIN_PX, MARGIN = 13.0, 0.12
+MARGIN = 0.12  # of a silhouette's width: corners closer to its border may be those of what lies beside it
 SETTLED = 0.1  # m/s: what stands may seem to go
 
 
@@ -21,7 +22,8 @@ def paces(camera: GroundCamera, pose: Array, size: Array, expected: Array, moves
     """Speed (N,) m/s along their headings and its deviation (N,) of boxes with pose (N, 3), size (N, 3) and an
     expected speed (N,); NaN of those with too few corners.
 
-    A corner belongs to the side of a box that is nearest along its line of sight, at whose height it moves.
+    A corner belongs to the side of a box that is nearest along its line of sight, at whose height it moves. Near the
+    outline it tells little: where a vehicle of one colour meets what stands, the place where they meet goes slowly.
     """
     speed, sigma = np.full(len(pose), np.nan), np.full(len(pose), np.nan)
     if not len(moves.now) or not len(pose):
@@ -37,7 +39,7 @@ def paces(camera: GroundCamera, pose: Array, size: Array, expected: Array, moves
     aside = ahead[:, 0] * gone[:, 1] - ahead[:, 1] * gone[:, 0]
     noise = CORNER_PX * np.linalg.norm(np.einsum("ni,nij->nj", ahead, way_of), axis=1)
     good = (owner >= 0) & (np.abs(aside) < np.abs(along) + 3 * noise)
-    good &= _depth_inside(camera, pose, size, moves.now, owner)
+    good &= _well_inside(camera, pose, size, moves.now, owner)
     for k in range(len(pose)):
         mine = good & (owner == k)
         if np.count_nonzero(mine) < LEAST:
@@ -51,17 +53,17 @@ def paces(camera: GroundCamera, pose: Array, size: Array, expected: Array, moves
     return speed, sigma
 
 
-def _depth_inside(camera: GroundCamera, pose: Array, size: Array, pixels: Array, owner: Array) -> Array:
-    """Which of the corners at pixels (n, 2) lie so far inside of their box's outline that they are its own."""
+def _well_inside(camera: GroundCamera, pose: Array, size: Array, pixels: Array, owner: Array) -> NDArray[np.bool_]:
+    """Which of the corners at pixels (n, 2) lie so far inside of the outline of their box that it alone moves them."""
     inside = np.zeros(len(pixels), dtype=bool)
     for k in np.unique(owner[owner >= 0]):
         hull = wireframe.silhouette(camera, pose[k], size[k])
         if not len(hull):
             continue
-        along = np.roll(hull, -1, axis=0) - hull
-        normal = np.column_stack([-along[:, 1], along[:, 0]]) / np.linalg.norm(along, axis=1)[:, None]
-        depth = np.abs(((pixels[owner == k][:, None] - hull) * normal).sum(axis=2)).min(axis=1)
-        inside[owner == k] = depth > min(MARGIN_PX, MARGIN * np.ptp(hull[:, 0]))
+        side = np.roll(hull, -1, axis=0) - hull
+        normal = np.column_stack([-side[:, 1], side[:, 0]]) / np.linalg.norm(side, axis=1)[:, None]
+        depth = np.abs(np.sum((pixels[owner == k, None] - hull) * normal, axis=2)).min(axis=1)
+        inside[owner == k] = depth > min(window_px(camera), MARGIN * np.ptp(hull[:, 0]))
     return inside
 
 

@@ -12,7 +12,7 @@ from visfuse_cli.vision.background import FOREGROUND, SHADOW
 
 LIT = 128.0  # what a picture as light as the background is scaled to
 SOFT = 7  # of these levels, across three pixels: an outline, also that of grey paint on a grey road, is a step
-FADES = 0.3  # share of its rim along which a soft shadow fades into the ground; grey paint has an edge around it
+FADES = 0.15  # share of its rim along which a soft shadow fades into the ground; grey paint has an edge around it
 LEARN_EVERY = 8  # frames
 KEPT = 0.98  # of what is known of the darkness, each time it is learnt
 ALIKE = 0.12  # of the darkness of shadows that shadows may differ by

@@ -59,7 +59,7 @@ class MovingPoints:
 
     def __init__(self, camera: GroundCamera) -> None:
         self._camera = camera
-        self._scale = max(1.0, camera.image_size[0] / WIDTH_PX)
+        self._scale = _scale(camera)
         self._last: Image | None = None
         self._place = np.zeros((0, 2), np.float32)  # px of the small picture
         self._ground = np.zeros((0, 2))  # m
@@ -142,6 +142,16 @@ class MovingPoints:
         self._anchor = np.concatenate([self._anchor, np.column_stack([fresh, ground])])
         self._velocity = np.concatenate([self._velocity, np.full(ground.shape, np.nan)])
         self._course = np.concatenate([self._course, np.full(len(fresh), np.nan)])
+
+
+def window_px(camera: GroundCamera) -> float:
+    """How far (px) around a corner the picture tells where it goes."""
+    return WINDOW[0] / 2 * _scale(camera)
+
+
+def _scale(camera: GroundCamera) -> float:
+    """How many times as large as the small pictures those of a camera are."""
+    return max(1.0, camera.image_size[0] / WIDTH_PX)
 
 
 def _best_of_cells(sharp: Array, taken: Array) -> Array:
