@@ -7,11 +7,13 @@ from masks import CAR, TRUCK, evidence_of, labels_of, road_camera
 from visfuse_cli.maths.cameras import project
 from visfuse_cli.tracking import dynamics as dynamics_tools
 from visfuse_cli.tracking import texture
+from visfuse_cli.tracking.evidence import LabelEvidence
 from visfuse_cli.tracking.ground import GroundTracker
 from visfuse_cli.tracking.joining import goes_on, part_before
 from visfuse_cli.tracking.settings import VEHICLES, FilterSettings, TargetSettings, TrackerSettings
 from visfuse_cli.tracking.targets import Sample, Track
-from visfuse_cli.vision.points import Moves
+from visfuse_cli.vision import regions
+from visfuse_cli.vision.points import Corners, Courses, Moves
 from visfuse_cli.vision.wireframe import silhouette, tangents
 
 CAMERA = road_camera()
@@ -62,6 +64,26 @@ def test_corners_where_a_box_meets_what_stands_do_not_hold_it_back():
     assert len(border) > len(moves.now)
     pace, _ = texture.paces(CAMERA, pose, TRUCK[None], np.full(1, 5.0), both)
     assert pace[0] == pytest.approx(5.0, abs=0.1)
+
+
+@pytest.mark.parametrize("seconds", [0.1, 1.0])
+def test_a_box_that_the_corners_on_it_leave_goes_with_them(seconds):
+    place = np.array([1.0, 20.0, np.pi / 2])
+    dynamics, track = track_along(1, range(20), np.tile(place, (20, 1)))
+    tracker = GroundTracker(CAMERA, TrackerSettings(target=TargetSettings(classes=VEHICLES)))
+    tracker.tracks = [track]
+    labels = labels_of(CAMERA, [(place, CAR)])  # what stood beside it keeps the place where it was filled
+    nowhere = Courses(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0))
+    for frame in range(20, 20 + round(seconds / DT)):
+        tracker.predict(frame * DT)
+        (pose,), _ = tracker.expected()
+        points = on_near_side(pose, CAR, np.random.default_rng(frame))
+        corners = Corners(moves_of(points, np.array([0.0, 4.0])), nowhere)
+        seen = LabelEvidence(labels, CAMERA, regions.bands(CAMERA), 0.3, 0.12, 0.5, corners=lambda told=corners: told)
+        tracker.update(frame, seen)
+    (left,) = (each for each in tracker.tracks if each.id == 1)
+    speed = dynamics.planar(left.steps[-1].posterior.mean)[0][3]
+    assert speed < 0.5 if seconds < 0.3 else speed > 2.5
 
 
 def test_corners_belong_to_the_box_in_front_and_few_tell_nothing():

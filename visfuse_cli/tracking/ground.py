@@ -8,7 +8,6 @@ from collections.abc import Callable, Sequence
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
 from visfuse_cli.maths.assignment import gate_size
 from visfuse_cli.maths.cameras import project
@@ -39,7 +38,8 @@ DOUBTFUL, MOVED_M = 0.25, 2.0  # share of the border that is not clear, to compa
 WAIT_AT_MOST_S = 6.0  # before a doubtful track is compared again
 BETTER, COMPARED = 1.2, 8  # times as much then, over so many of the last frames
 LOOK_BACK_FRAMES = 120  # at most
-HIDDEN = 0.8  # of a box in view, below which the corners on it are asked how fast it goes
+HIDDEN = 0.8  # of a box in view, below which the corners on it tell how fast it goes
+SLIP_S, SLIPS = 0.3, 1.2  # s, and deviations by which the corners may go elsewhere: its outline is then another's
 REACH_PX, REACH_SHARE = (4.0, 24.0), 0.2  # how far from its prediction an outline is looked for; of its height
 MISLED = ("no longer looks like itself", "jumped", "lost")  # ends of tracks that may have left their vehicle
 BESIDE_M = 6.0  # m between two tracks that may be parts of one vehicle
@@ -144,7 +144,7 @@ class GroundTracker:
         border = np.where(np.isnan(look.likeness), look.border, look.likeness) * fit.agreed
         there = fit.ok & measure.looks_right(fit, look.outlines) & (look.moved > SEEN_SHARE) & ~(border < SEEN_SHARE)
         there &= look.open > LEAST_OPEN
-        along, pace, doubt = self._paces(pose, size, look.open < HIDDEN, evidence)
+        along, pace, ahead, doubt = self._paces(pose, size, evidence)
         for k, track in enumerate(self.tracks):
             step = dynamics_tools.coast(self._expected[k])
             if np.isfinite(border[k]):
@@ -153,7 +153,8 @@ class GroundTracker:
                 seen = look.border[k] * fit.agreed[k] * np.nan_to_num(look.clear[k], nan=1.0)
                 track.doubt += (1 - seen - track.doubt) * share
             sample = Sample.of(frame, self._t, look, k, border, False)
-            if there[k]:
+            slips = self._slips(track, ahead[k], doubt[k])
+            if there[k] and not slips:
                 z, R = self.dynamics.measured(*measure.measurement(fit, k, pose[k]))
                 tried = dynamics_tools.take(self.dynamics, self._expected[k], z, R)
                 if self._plausible(track, tried, z, R):
@@ -163,23 +164,28 @@ class GroundTracker:
                 else:
                     track.refused += 1
                     track.refused_since = sample.t if track.refused_since is None else track.refused_since
-            if np.isfinite(pace[k]):
+            if np.isfinite(pace[k]) and (slips or look.open[k] < HIDDEN):
                 step = dynamics_tools.take_speed(self.dynamics, step, along[k], pace[k], doubt[k])
             track.samples.append(sample)
             track.steps.append(step)
 
-    def _paces(
-        self, pose: Array, size: Array, hidden: NDArray[np.bool_], evidence: Evidence
-    ) -> tuple[Array, Array, Array]:
-        """Headings (N, 2), and speeds (N,) m/s along them with their deviations (N,), as the corners on the boxes that
-        are partly `hidden` (N,) tell; NaN of the others."""
+    def _slips(self, track: Track, ahead: float, doubt: float) -> bool:
+        """Whether the corners on a box have been `ahead` (m/s, deviation `doubt`) of it for so long that it slips."""
+        share = min(1.0, (self._t - track.samples[-1].t) / SLIP_S)
+        track.slip = track.slip + (ahead / doubt - track.slip) * share if np.isfinite(ahead) else 0.0
+        return abs(track.slip) >= SLIPS
+
+    def _paces(self, pose: Array, size: Array, evidence: Evidence) -> tuple[Array, Array, Array, Array]:
+        """Headings (N, 2), and as the corners on the boxes tell: speeds (N,) m/s along them, how much faster (N,) that
+        is than expected, and the deviations (N,); NaN where they tell nothing."""
         along = np.column_stack([np.cos(pose[:, 2]), np.sin(pose[:, 2])])
-        if not hidden.any() or (corners := evidence.corners()) is None:
-            return along, np.full(len(pose), np.nan), np.full(len(pose), np.nan)
+        if (corners := evidence.corners()) is None:
+            nothing = np.full(len(pose), np.nan)
+            return along, nothing, nothing, nothing
         velocity = self.dynamics.planar(np.array([each.prior.mean for each in self._expected]))[0][:, 2:]
         expected = np.sum(velocity * along, axis=1)
         pace, doubt = texture.paces(self.camera, pose, size, expected, corners.moves)
-        return along, np.where(hidden, pace, np.nan), doubt
+        return along, pace, pace - expected, doubt
 
     def _reconsider(self, evidence: Evidence) -> None:
         """Look at the track with the most doubt about it as if it were new, and put the better guess in its place."""

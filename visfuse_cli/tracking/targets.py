@@ -62,6 +62,7 @@ class Track:
     last_measured: float
     likeness: float = 1.0  # share of its border that was found lately
     doubt: float = 0.0  # share of its border that was not found or has something moving outside, lately
+    slip: float = 0.0  # deviations by which the corners on it are faster than its box, lately
     compared: Comparison = field(default_factory=Comparison)  # with other boxes
     refused: int = 0  # measurements that fell outside the gate
     refused_since: float | None = None  # s: since when all of them did
