@@ -48,6 +48,17 @@ def test_grey_paint_and_the_shadows_of_the_sun_have_an_edge(dark):
     assert np.count_nonzero(left) > 0.95 * np.count_nonzero(labels)
 
 
+def test_a_hole_in_a_body_is_no_ground_that_it_fades_into():
+    v, u = np.mgrid[:H, :W]
+    deep = np.maximum(
+        np.abs(v - 120) / 50, np.abs(u - 160) / 70
+    )  # 1 at the edge of a body that is lightest in its middle
+    labels, light = picture(np.where(deep < 1, 1 - 0.4 * deep, 1.0))
+    assert np.count_nonzero((labels == 0) & (deep < 1)) > 100
+    left = without_soft_shadows(labels, light)
+    assert np.count_nonzero(left) > 0.95 * np.count_nonzero(labels)
+
+
 def beside(shadow, paint):
     """A vehicle of `paint` with the shadow that it casts, and its outline."""
     light = np.ones((H, W))

@@ -39,7 +39,7 @@ WAIT_AT_MOST_S = 6.0  # before a doubtful track is compared again
 BETTER, COMPARED = 1.2, 8  # times as much then, over so many of the last frames
 LOOK_BACK_FRAMES = 120  # at most
 HIDDEN = 0.8  # of a box in view, below which the corners on it tell how fast it goes
-SLIP_S, SLIPS = 0.3, 1.2  # s, and deviations by which the corners may go elsewhere: its outline is then another's
+SLIP_S, SLIPS = 0.3, (0.8, 0.3)  # s, and deviations by which corners leave a box, until they have it with them again
 REACH_PX, REACH_SHARE = (4.0, 24.0), 0.2  # how far from its prediction an outline is looked for; of its height
 MISLED = ("no longer looks like itself", "jumped", "lost")  # ends of tracks that may have left their vehicle
 BESIDE_M = 6.0  # m between two tracks that may be parts of one vehicle
@@ -170,10 +170,11 @@ class GroundTracker:
             track.steps.append(step)
 
     def _slips(self, track: Track, ahead: float, doubt: float) -> bool:
-        """Whether the corners on a box have been `ahead` (m/s, deviation `doubt`) of it for so long that it slips."""
+        """Whether a box is left behind by the corners on it, which are `ahead` (m/s, deviation `doubt`) of it."""
         share = min(1.0, (self._t - track.samples[-1].t) / SLIP_S)
         track.slip = track.slip + (ahead / doubt - track.slip) * share if np.isfinite(ahead) else 0.0
-        return abs(track.slip) >= SLIPS
+        track.slips = bool(abs(track.slip) > SLIPS[track.slips])
+        return track.slips
 
     def _paces(self, pose: Array, size: Array, evidence: Evidence) -> tuple[Array, Array, Array, Array]:
         """Headings (N, 2), and as the corners on the boxes tell: speeds (N,) m/s along them, how much faster (N,) that

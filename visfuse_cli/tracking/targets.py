@@ -63,6 +63,7 @@ class Track:
     likeness: float = 1.0  # share of its border that was found lately
     doubt: float = 0.0  # share of its border that was not found or has something moving outside, lately
     slip: float = 0.0  # deviations by which the corners on it are faster than its box, lately
+    slips: bool = False  # whether the box is left behind by them
     compared: Comparison = field(default_factory=Comparison)  # with other boxes
     refused: int = 0  # measurements that fell outside the gate
     refused_since: float | None = None  # s: since when all of them did
