@@ -50,11 +50,9 @@ def test_grey_paint_and_the_shadows_of_the_sun_have_an_edge(dark):
 
 def test_a_hole_in_a_body_is_no_ground_that_it_fades_into():
     v, u = np.mgrid[:H, :W]
-    deep = np.maximum(
-        np.abs(v - 120) / 50, np.abs(u - 160) / 70
-    )  # 1 at the edge of a body that is lightest in its middle
-    labels, light = picture(np.where(deep < 1, 1 - 0.4 * deep, 1.0))
-    assert np.count_nonzero((labels == 0) & (deep < 1)) > 100
+    out = np.maximum(np.abs(v - 120) / 70, np.abs(u - 160) / 100)  # 1 at the edge of a body that is as the road inside
+    labels, light = picture(np.where(out < 1, 1 - np.clip(out - 0.6, 0, None), 1.0))
+    assert np.count_nonzero((labels == 0) & (out < 1)) > 1000
     left = without_soft_shadows(labels, light)
     assert np.count_nonzero(left) > 0.95 * np.count_nonzero(labels)
 
