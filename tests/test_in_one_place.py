@@ -11,6 +11,7 @@ from visfuse_cli.tracking.association import footprint_overlap, shared_footprint
 from visfuse_cli.tracking.places import Places, Stand
 
 CAR = np.array([4.2, 1.8, 1.5])
+SURE = SimpleNamespace(speed=10.0, noise=0.1)
 
 
 def path(identity, aside=0.0, frames=range(100), ahead=0.0, apart=1.0):
@@ -21,24 +22,24 @@ def path(identity, aside=0.0, frames=range(100), ahead=0.0, apart=1.0):
     planar = SimpleNamespace(mean=mean)
     return SimpleNamespace(
         id=identity, frame=frame, t=frame / 25, planar=planar, heading=0.0 * frame, size=CAR, measured=known,
-        support=0.9, apart=apart, paint=0.9,
+        support=0.9, apart=apart, paint=0.9, size_z=1.0,
     )  # fmt: skip
 
 
 def test_the_one_for_which_less_speaks_is_kept_out_or_put_out():
     places = Places()
-    assert places.take(path(1)) == (None, [])
-    assert places.take(path(2, ahead=1.0, apart=0.9)) == (1, [])
-    assert places.take(path(3, ahead=0.5, frames=range(150))) == (None, [1])
-    assert places.take(path(4, ahead=1.0)) == (3, [])
+    assert places.take(path(1), SURE) == (None, [])
+    assert places.take(path(2, ahead=1.0, apart=0.9), SURE) == (1, [])
+    assert places.take(path(3, ahead=0.5, frames=range(150)), SURE) == (None, [1])
+    assert places.take(path(4, ahead=1.0), SURE) == (3, [])
 
 
 def test_one_that_is_kept_out_puts_out_nobody():
     places = Places()
-    places.take(path(1, ahead=-2.1, apart=0.8))
-    places.take(path(2, ahead=2.1))
-    assert places.take(path(3, apart=0.9)) == (2, [])
-    assert places.take(path(4, ahead=-3.0, apart=0.85)) == (None, [1])
+    places.take(path(1, ahead=-2.1, apart=0.8), SURE)
+    places.take(path(2, ahead=2.1), SURE)
+    assert places.take(path(3, apart=0.9), SURE) == (2, [])
+    assert places.take(path(4, ahead=-3.0, apart=0.85), SURE) == (None, [1])
 
 
 @pytest.mark.parametrize(
@@ -54,31 +55,31 @@ def test_one_that_is_kept_out_puts_out_nobody():
 )
 def test_neighbours_live_side_by_side(other):
     places = Places()
-    places.take(path(1))
-    assert places.take(other) == (None, [])
+    places.take(path(1), SURE)
+    assert places.take(other, SURE) == (None, [])
 
 
 def test_a_brief_crossing_is_no_reason():
     a, b = path(1), path(2, aside=8.0)
     b.planar.mean[:, 1] = np.linspace(8, -8, 100)  # through the other one's way
     places = Places()
-    places.take(a)
-    assert places.take(b) == (None, [])
+    places.take(a, SURE)
+    assert places.take(b, SURE) == (None, [])
 
 
 def test_what_nothing_can_meet_any_more_is_forgotten():
     places = Places()
-    places.take(path(1))
+    places.take(path(1), SURE)
     places.forget(99)
-    assert places.take(path(2, apart=0.9)) == (1, [])
+    assert places.take(path(2, apart=0.9), SURE) == (1, [])
     places.forget(100)
-    assert places.take(path(3, apart=0.9)) == (None, [])
+    assert places.take(path(3, apart=0.9), SURE) == (None, [])
 
 
 def test_predictions_are_no_stand():
     seen = path(1)
     seen.measured[10:] = False
-    assert list(Stand.of(seen).frame) == list(range(10))
+    assert list(Stand.of(seen, SURE).frame) == list(range(10))
 
 
 def test_footprints_each_are_the_pairs_of_all():
