@@ -23,7 +23,7 @@ GOOD_ENOUGH, LONGER_FOR = 0.01, 1.5  # standard deviation of a speed over itself
 DOUBTFUL_ENDS, SHORT_S = ("jumped", "no longer looks like itself"), 1.0  # s: a track that does so sooner is nothing
 APART, SOLID, LASTING, EXACT, ODD = 3.0, 1.9, 0.75, 0.5, 0.42  # a logistic fit to traffic, true tracks against false
 SHORT_LOOK_S, USUAL_NOISE, SLOW = 2.0, 0.01, 1.5  # s; of a speed; m/s: of what is slower no share of its speed is asked
-LIKE_A_PART = 0.7  # what it takes off that a slim thing looks like parts of others, whatever its size
+LIKE_A_PART = 0.5  # what it takes off that a slim thing looks like parts of others, whatever its size
 UNSEEN_S = 1.5  # s: a stretch goes over no longer gap
 JUMP_S = 0.3  # s a change of speed is looked at
 SUDDEN = 2.5  # times as much as it is counts what a vehicle gains: it cannot as fast as it brakes
@@ -45,7 +45,7 @@ class SpeedSettings(Section):
         description="share of its outline that was found, plus 3 times the share that does not lie in the midst of "
         "others, plus 1.9 times the share of its area that is neither shadow nor empty road, plus 0.75 times the "
         "logarithm of the time it was seen over 2 s, less 0.5 times that of its speed's noise over 1 % of it, less "
-        "0.42 for each deviation of its size from its class, or 0.7 for what is long and narrower than a metre",
+        "0.42 for each deviation of its size from its class, or 0.5 for what is long and narrower than a metre",
     )
     min_measured: float = Field(0.6, ge=0, le=1, description="share of a track's frames that must be measured")
     max_misfit: float = Field(0.2, gt=0, le=5, description="outline misfit over outline size: above, no such box")
