@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from benchmarks import arterial
 from samples.files import write_scene
 from samples.road import KINDS
 from samples.score import heading_errors, matches, rows
@@ -106,3 +107,6 @@ def test_city_arterial_runs_at_plausible_speeds(tmp_path):
     assert len(away) >= 6
     free = [float(row["speed_kmh"]) for row in away if float(row["speed_kmh"]) > 30]
     assert 35 < np.median(free) < 60
+    timed = [(by_eye, ours) for first, _, by_eye, _, ours in arterial.compared(tmp_path / "run") if first < 280]
+    assert len(timed) == 6
+    assert all(abs(ours / by_eye - 1) < (0.06 if by_eye < 50 else 0.08) for by_eye, ours in timed), timed
