@@ -13,7 +13,7 @@ from visfuse_cli.tracking.dynamics import WHEELBASE_SHARE, for_target
 from visfuse_cli.tracking.evidence import BoxEvidence
 from visfuse_cli.tracking.ground import GroundTracker
 from visfuse_cli.tracking.settings import PERSON, FilterSettings, LifeSettings, TargetSettings, TrackerSettings
-from visfuse_cli.tracking.verdict import SpeedSettings, evidence
+from visfuse_cli.tracking.verdict import SpeedSettings, evidence, judge
 from visfuse_cli.vision import regions, wireframe
 
 CAMERA = road_camera()
@@ -142,6 +142,16 @@ def test_half_an_outline_is_believed_when_it_was_seen_for_long_and_stands_apart(
     assert seen(0.5, 0.9, 0.6, 12.0) > least
     assert seen(0.4, 0.85, 0.05, 12.0) < least
     assert seen(0.6, 0.5, 0.9, 4.0) < least
+
+
+def test_who_starts_fast_has_not_jumped():
+    t = np.arange(75) / FPS
+    way = t + 5.0 * t**2 / 2
+    tracker, tracks, _ = follow([[(pose, CAR)] for pose in drive([1.0, 12.0], [0.05, 1.0], way)])
+    (path,) = conclude(tracks, CAMERA, TrackerSettings(), tracker.dynamics)
+    verdict = judge(path, CAMERA.ground.cov, 1.0, SpeedSettings(), np.ones(len(path.t), dtype=bool))
+    assert verdict.reason == ""
+    assert verdict.speed == pytest.approx(1.0 + 5.0 * (path.t[verdict.first] + path.t[verdict.last]) / 2, abs=0.1)
 
 
 def test_what_never_moves_is_given_up_with_its_place():

@@ -26,7 +26,7 @@ SHORT_LOOK_S, USUAL_NOISE, SLOW = 2.0, 0.01, 1.5  # s; of a speed; m/s: of what 
 LIKE_A_PART = 0.5  # what it takes off that a slim thing looks like parts of others, whatever its size
 UNSEEN_S = 1.5  # s: a stretch goes over no longer gap
 JUMP_S = 0.3  # s a change of speed is looked at
-SUDDEN = 2.5  # times as much as it is counts what a vehicle gains: it cannot as fast as it brakes
+SUDDEN = 2.0  # times as much as it is counts what a vehicle gains: it cannot as fast as it brakes
 WANDER_PX, WANDER_S = 0.6, 2.0  # px by which outlines lie off, and s for which they do: noise that frames share
 
 
