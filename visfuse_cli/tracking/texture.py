@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from visfuse_cli.maths.cameras import project
 from visfuse_cli.maths.percentiles import median
+from visfuse_cli.maths.polygons import distance
 from visfuse_cli.records import Array, GroundCamera
 from visfuse_cli.vision import wireframe
 from visfuse_cli.vision.points import Moves, window_px
@@ -58,12 +59,9 @@ def _well_inside(camera: GroundCamera, pose: Array, size: Array, pixels: Array, 
     inside = np.zeros(len(pixels), dtype=bool)
     for k in np.unique(owner[owner >= 0]):
         hull = wireframe.silhouette(camera, pose[k], size[k])
-        if not len(hull):
-            continue
-        side = np.roll(hull, -1, axis=0) - hull
-        normal = np.column_stack([-side[:, 1], side[:, 0]]) / np.linalg.norm(side, axis=1)[:, None]
-        depth = np.abs(np.sum((pixels[owner == k, None] - hull) * normal, axis=2)).min(axis=1)
-        inside[owner == k] = depth > min(window_px(camera), MARGIN * np.ptp(hull[:, 0]))
+        if len(hull):
+            margin = min(window_px(camera), MARGIN * float(np.ptp(hull[:, 0])))
+            inside[owner == k] = distance(hull, pixels[owner == k]) > margin
     return inside
 
 
