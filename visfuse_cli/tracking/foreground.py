@@ -71,8 +71,8 @@ class Detector(Protocol):
 class _Seen:
     """A frame against the background (H, W): in grey, and how light it is.
 
-    raw: its labels; hard: without shadows that fade into the ground; labels: what is thought of them; cleaned: these
-    without specks; sunny: whether shadows are told by their darkness.
+    raw: its labels; hard: without shadows that fade into the ground, of which the sun casts none; labels: what is
+    thought of them; cleaned: these without specks; sunny: whether shadows are told by their darkness.
     """
 
     grey: Image

@@ -1,4 +1,4 @@
-"""How fast boxes go by the corners on them: what holds a box in its place where neighbours hide its outline."""
+"""How fast boxes go by the corners on them: what moves a box where neighbours hide its outline or lend it theirs."""
 
 from __future__ import annotations
 
