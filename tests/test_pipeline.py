@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 from clips import write_clip
 
+from visfuse_cli.elsewhere import AHEAD, ahead
 from visfuse_cli.files.video import open_source
-from visfuse_cli.pipeline import AHEAD, Run, ahead, foreseen, helper
+from visfuse_cli.pipeline import Run
 from visfuse_cli.records import Frame
 
 
@@ -168,25 +169,3 @@ def test_counts_stages_and_warnings_add_up():
         with run.stage("flow"):
             pass
     assert (run.warnings, run.counts["tracks"], list(run.stages)) == (("same",), 4, ["flow"])
-
-
-@pytest.mark.parametrize("length", [0, 1, 2, 3, 7])
-def test_what_comes_later_is_foreseen_so_far_ahead_and_nothing_is_lost(length):
-    told, taken = [], []
-    for item in foreseen(iter(range(length)), told.append, 2):
-        taken.append(item)
-        assert told == list(range(min(item + 3, length)))
-    assert taken == list(range(length))
-
-
-@pytest.mark.parametrize("cap", ["1", "2"])
-def test_work_that_is_handed_over_is_done_in_order_and_its_error_raised_where_it_is_asked_for(monkeypatch, cap):
-    monkeypatch.setenv("VISFUSE_THREADS", cap)
-    done = []
-    with helper() as hand_over:
-        results = [hand_over(lambda k=k: done.append(k) or k * k) for k in range(20)]
-        assert results[-1]() == 361
-        assert done == list(range(20))
-        assert [result() for result in results] == [k * k for k in range(20)]
-        with pytest.raises(ZeroDivisionError):
-            hand_over(lambda: 1 / 0)()

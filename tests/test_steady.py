@@ -6,7 +6,7 @@ import pytest
 
 from visfuse_cli.records import Frame
 from visfuse_cli.tracking.annotate import RED, mark_camera
-from visfuse_cli.tracking.camera_watch import CameraWatch
+from visfuse_cli.tracking.camera_watch import CameraLog, CameraWatch, Motions
 from visfuse_cli.vision.exposure import Exposure, levelled
 from visfuse_cli.vision.steady import Steady, at_rest, moved
 
@@ -90,14 +90,16 @@ def test_pictures_are_laid_over_one_another_at_their_middle():
         assert np.abs(picture.astype(int) - middle)[8:-8, 8:-8].mean() < 1.5
 
 
-def _watched(motions: list[np.ndarray | None], fps: float = 25.0) -> CameraWatch:
+def _watched(motions: list[np.ndarray | None], fps: float = 25.0) -> tuple[CameraLog, Motions]:
     scene = _scene()
-    watch = CameraWatch(_seen(scene, np.eye(3)))
+    watch, remembered = CameraWatch(_seen(scene, np.eye(3))), Motions()
     covered = np.full((*SIZE[::-1], 3), 20, np.uint8)
     for index, motion in enumerate(motions):
         image = covered if motion is None else _seen(scene, motion, seed=index)
-        watch.steadied(Frame("image", index, index / fps, image))
-    return watch
+        steadied = watch.steadied(Frame("image", index, index / fps, image))
+        if steadied is not None:
+            remembered.note(steadied)
+    return watch.log, remembered
 
 
 @pytest.mark.parametrize("knocked", [5, 8, 17])
@@ -114,35 +116,35 @@ def test_a_knock_while_the_scene_is_learnt_does_not_move_where_the_camera_rests(
 
 
 def test_a_quiet_camera_is_left_alone():
-    watch = _watched([np.eye(3)] * 60)
-    assert watch.report() == {
+    log, remembered = _watched([np.eye(3)] * 60)
+    assert log.report() == {
         "shake_px": pytest.approx(0, abs=0.1),
         "moves": [],
         "not_measured": [],
         "exposure_gain": [1.0, 1.0],
     }
-    assert watch.warnings("a.mp4") == []
-    assert watch.image_from_rest(30) is None
+    assert log.warnings("a.mp4") == []
+    assert remembered.image_from_rest(30) is None
 
 
 def test_shake_is_measured_and_remembered():
     rng = np.random.default_rng(3)
     motions = [_turned(0, *rng.normal(0, 1.5, 2)) for _ in range(100)]
-    watch = _watched(motions)
-    assert watch.report()["shake_px"] == pytest.approx(1.5, rel=0.25)
-    assert watch.report()["moves"] == []
-    assert any("shakes by 1." in line for line in watch.warnings("a.mp4"))
-    found = watch.image_from_rest(40)
+    log, remembered = _watched(motions)
+    assert log.report()["shake_px"] == pytest.approx(1.5, rel=0.25)
+    assert log.report()["moves"] == []
+    assert any("shakes by 1." in line for line in log.warnings("a.mp4"))
+    found = remembered.image_from_rest(40)
     assert found is not None
     np.testing.assert_allclose(moved(found, CORNERS), moved(motions[40], CORNERS), atol=0.3)
 
 
 def test_a_knock_is_reported_once_with_its_time():
-    watch = _watched([np.eye(3)] * 75 + [_turned(0, 12.0, -5.0)] * 100)
-    (move,) = watch.report()["moves"]
+    log, _ = _watched([np.eye(3)] * 75 + [_turned(0, 12.0, -5.0)] * 100)
+    (move,) = log.report()["moves"]
     assert move["t"] == pytest.approx(3.0, abs=0.21)
     assert move["px"] == pytest.approx(13.0, abs=0.5)
-    assert "calibrate again" in watch.warnings("a.mp4")[-1]
+    assert "calibrate again" in log.warnings("a.mp4")[-1]
 
 
 def test_a_darker_exposure_is_brought_back():
@@ -162,23 +164,23 @@ def test_darkness_has_no_gain():
 
 
 def test_a_covered_camera_is_not_measured():
-    watch = _watched([np.eye(3)] * 30 + [None] * 25 + [np.eye(3)] * 30)
-    ((first, last),) = watch.report()["not_measured"]
+    log, _ = _watched([np.eye(3)] * 30 + [None] * 25 + [np.eye(3)] * 30)
+    ((first, last),) = log.report()["not_measured"]
     assert first == pytest.approx(1.2, abs=0.21)  # a quiet camera is looked at every fifth frame
     assert last == pytest.approx(54 / 25)
-    assert watch.was_lost(2.0)
-    assert not watch.was_lost(2.5)
-    assert "could not be recognised for 0.96 s, first at 1.20 s" in watch.warnings("a.mp4")[0]
+    assert log.was_lost(2.0)
+    assert not log.was_lost(2.5)
+    assert "could not be recognised for 0.96 s, first at 1.20 s" in log.warnings("a.mp4")[0]
 
 
-def test_the_video_says_what_the_watch_found():
-    watch = CameraWatch(_seen(_scene(), np.eye(3)))
-    watch.lost.append([2.0, 3.0])
-    watch.moves.append({"t": 5.0, "px": 9.0})
+def test_the_video_says_what_is_known_of_the_camera():
+    log = CameraLog()
+    log.lost.append([2.0, 3.0])
+    log.moves.append({"t": 5.0, "px": 9.0})
     red, written = [], []
     for t in (1.0, 2.5, 6.0):
         picture = np.zeros((360, 640, 3), np.uint8)
-        mark_camera(Frame("image", 0, t, picture), watch)
+        mark_camera(Frame("image", 0, t, picture), log)
         red.append(bool((picture[0, 320] == RED).all()))
         written.append(int(np.flatnonzero((picture[325:353, 6:630] > 90).any(axis=(0, 2))).max()))
     assert red == [False, True, False]

@@ -8,9 +8,8 @@ import signal
 import sys
 import threading
 import time
-from collections import Counter, deque
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -21,6 +20,7 @@ from typing import Any, Protocol, TypeVar
 import cv2
 from tqdm import tqdm
 
+from visfuse_cli.elsewhere import AHEAD, ahead
 from visfuse_cli.files.folders import paths_of
 from visfuse_cli.files.run_json import write_run_json
 from visfuse_cli.files.runfolder import RunFolder
@@ -28,10 +28,9 @@ from visfuse_cli.files.spool import TrackSpool
 from visfuse_cli.files.video import VideoSource
 from visfuse_cli.records import Frame, FrameSet, RunRequest, TimeAudit
 from visfuse_cli.threads import thread_cap
-from visfuse_cli.tracking.elsewhere import HandOver, at_once
 
 T = TypeVar("T")
-AHEAD = 3  # pictures that wait between two threads: enough to even out, too few to fill memory
+ENDED = object()
 GAP = 2.5  # intervals without a frame of the leading view that are bridged
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
@@ -133,16 +132,13 @@ class Run:
 
     def frames(self, source: VideoSource, total: int | None = None) -> Iterator[Frame]:
         """The frames of one clip, decoded ahead in a thread, until they end or the run is stopped."""
-        return self.prepared(source, lambda frame: frame, total)
+        with ahead(source.frames) as frames:
+            yield from self.told(frames, source.frame_count if total is None else total)
 
-    def prepared(self, source: VideoSource, prepare: Callable[[Frame], T], total: int | None = None) -> Iterator[T]:
-        """What `prepare` makes of the frames of one clip, one after another, in the thread that decodes them."""
-
-        def produce() -> Iterator[tuple[T]]:
-            return ((prepare(frame),) for frame in source.frames())
-
-        with ahead(produce) as items, self._bar(source.frame_count if total is None else total) as bar:
-            for (item,) in self._waited(items):
+    def told(self, items: Iterable[T], total: int | None) -> Iterator[T]:
+        """The same items, as many as `total` where that is known, with a progress bar, until the run is stopped."""
+        with self._bar(total) as bar:
+            for item in self._waited(iter(items)):
                 yield item
                 bar.update()
                 if self.stopped_by is not None:
@@ -200,10 +196,10 @@ class Run:
         """The same items; waiting for them is the stage `decode`."""
         while True:
             with self.stage("decode"):
-                item = next(items, None)
-            if item is None:
+                item = next(items, ENDED)
+            if item is ENDED:
                 return
-            yield item
+            yield item  # type: ignore[misc]
 
     def _bar(self, total: int | None) -> Any:
         return tqdm(total=total, unit=" frames", file=sys.stderr, disable=not self.progress, leave=False)
@@ -282,30 +278,6 @@ class _Cursor:
         return best
 
 
-def foreseen(items: Iterator[T], foresee: Callable[[T], None], count: int) -> Iterator[T]:
-    """The same items; `foresee` is told of each when `count` others still come before it."""
-    waiting: deque[T] = deque()
-    for item in items:
-        foresee(item)
-        waiting.append(item)
-        if len(waiting) > count:
-            yield waiting.popleft()
-    yield from waiting
-
-
-@contextmanager
-def helper() -> Iterator[HandOver]:
-    """A thread for pieces of work, one at a time: hand them over, call what comes back for the result.
-
-    Where a run may use no other thread the work is done when it is handed over: the order is the same.
-    """
-    if thread_cap() == 1:
-        yield at_once
-        return
-    with ThreadPoolExecutor(1, "visfuse-help") as pool:
-        yield lambda work: pool.submit(work).result
-
-
 class _TimedWriter:
     """Writes in the thread of its caller, where a run may use no other."""
 
@@ -345,50 +317,3 @@ class _BackgroundWriter:
                     self._sink.write(*values)
                 except BaseException as problem:
                     self._problem = problem  # raised by the next `write`, or by `finish`
-
-
-@contextmanager
-def ahead(produce: Callable[[], Iterator[T]], limit: int = AHEAD) -> Iterator[Iterator[T]]:
-    """Run a generator in a thread of its own, at most `limit` items ahead; its exception is raised in the consumer.
-
-    The whole generator lives in that thread, decoders included; leaving the block ends and joins it. Where a run may
-    use no other thread, it is run in the consumer's.
-    """
-    if thread_cap() == 1:
-        yield produce()
-        return
-    items: queue.Queue[tuple[T | None, BaseException | None]] = queue.Queue(limit)
-    stopped = threading.Event()
-
-    def work() -> None:
-        problem: BaseException | None = None
-        try:
-            for item in produce():
-                items.put((item, None))
-                if stopped.is_set():
-                    return
-        except BaseException as raised:
-            problem = raised
-        items.put((None, problem))
-
-    def consume() -> Iterator[T]:
-        while True:
-            item, problem = items.get()
-            if problem is not None:
-                raise problem
-            if item is None:
-                return
-            yield item
-
-    thread = threading.Thread(target=work, name="visfuse-decode", daemon=True)
-    thread.start()
-    try:
-        yield consume()
-    finally:
-        stopped.set()
-        while thread.is_alive():  # a full queue holds the thread: empty it
-            try:
-                items.get(timeout=0.05)
-            except queue.Empty:
-                thread.join(0.01)
-        thread.join()

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
+Boxes = tuple[Array, Array]  # on the ground: poses (N, 3) x, y m and heading rad, and sizes (N, 3) m
 
 
 @dataclass(frozen=True, slots=True)

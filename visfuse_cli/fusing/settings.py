@@ -7,7 +7,7 @@ from typing import Literal
 from pydantic import Field, field_validator, model_validator
 
 from visfuse_cli.config import Section
-from visfuse_cli.tracking.foreground import BackgroundSettings
+from visfuse_cli.tracking.lookout import BackgroundSettings
 
 
 class PersonSettings(Section):

@@ -11,7 +11,7 @@ from visfuse_cli.maths.cameras import project
 from visfuse_cli.maths.polygons import Polygon
 from visfuse_cli.maths.speed import KMH
 from visfuse_cli.records import Array, Frame, GroundCamera, Image
-from visfuse_cli.tracking.camera_watch import CameraWatch
+from visfuse_cli.tracking.camera_watch import CameraLog, Motions
 from visfuse_cli.tracking.options import SpeedOptions
 from visfuse_cli.tracking.output import box_corners
 from visfuse_cli.tracking.privacy import Strangers, parts
@@ -103,7 +103,8 @@ def annotate(
     records: Iterable[dict[str, Any]],
     camera: GroundCamera,
     config: SpeedOptions,
-    watch: CameraWatch,
+    motions: Motions,
+    log: CameraLog,
     strangers: Strangers,
     places: Mapping[str, Polygon],
 ) -> Iterator[Frame]:
@@ -121,7 +122,7 @@ def annotate(
             active.append(_Drawn(upcoming, camera, config))
             upcoming = next(waiting, None)
         active = [drawn for drawn in active if drawn.last >= frame.index]
-        motion = watch.image_from_rest(frame.index)
+        motion = motions.image_from_rest(frame.index)
         here = np.eye(3) if motion is None else motion
         if config.privacy.blur:
             private = [outline for drawn in active for outline in drawn.blurred(frame.index)]
@@ -131,18 +132,18 @@ def annotate(
             place.draw(frame.image, here)
         for drawn in active:
             drawn.draw(frame.image, frame.index, here)
-        mark_camera(frame, watch)
+        mark_camera(frame, log)
         yield frame
 
 
-def mark_camera(frame: Frame, watch: CameraWatch) -> None:
-    """Write the time, and what the watch over the camera says of it; a frame in red is not measured."""
+def mark_camera(frame: Frame, log: CameraLog) -> None:
+    """Write the time, and what is known of the camera; a frame in red is not measured."""
     high, wide = frame.image.shape[:2]
     note, colour = f"{frame.t:.2f} s", (230, 230, 230)
-    if watch.was_lost(frame.t):
+    if log.was_lost(frame.t):
         note, colour = f"{note}  scene not recognised: not measured", RED
         border = np.array([[0, 0], [wide - 1, 0], [wide - 1, high - 1], [0, high - 1]], dtype=float)
         drawing.polyline(frame.image, border, RED, closed=True, width=max(4, high // 90))
-    elif (move := watch.last_move(frame.t)) is not None:
+    elif (move := log.last_move(frame.t)) is not None:
         note = f"{note}  camera moved by {move['px']:.1f} px at {move['t']:.1f} s: registered"
     drawing.label(frame.image, note, np.array([4.0, high]), colour)

@@ -9,12 +9,12 @@ import numpy as np
 
 from visfuse_cli.maths import homography
 from visfuse_cli.maths.cameras import ground_scale
-from visfuse_cli.records import Array, GroundCamera, Region
+from visfuse_cli.records import Array, Boxes, GroundCamera, Region
 from visfuse_cli.tracking import dynamics as dynamics_tools
 from visfuse_cli.tracking import measure
 from visfuse_cli.tracking.association import claim, footprint_overlap, region_boxes
 from visfuse_cli.tracking.dynamics import Dynamics, Step
-from visfuse_cli.tracking.evidence import Boxes, Evidence, LabelEvidence
+from visfuse_cli.tracking.evidence import Evidence, LabelEvidence
 from visfuse_cli.tracking.hypotheses import HEADING_SIGMA, Guess, best_guess
 from visfuse_cli.tracking.joining import part_before, places
 from visfuse_cli.tracking.lookback import Recent, trace

@@ -23,52 +23,84 @@ WORTH_TELLING_PX = 0.5  # of shake
 
 
 class CameraWatch:
-    """Registers the frames of one clip to the scene at rest and remembers where the camera looked in each."""
+    """Registers the frames of one clip to the scene at rest and keeps a log of where the camera looked."""
 
     def __init__(self, empty: Image) -> None:
+        self.log = CameraLog()
         self._steady, self._exposure = Steady(empty), Exposure(empty)
-        self._gains = 1.0, 1.0  # the least and the largest there were
         self._motion = np.eye(3)
         self._unchanged = 0  # frames
-        self._frames, self._entries = array("q"), array("f")  # frames in which it was elsewhere, and 9 numbers for each
-        self._recent: deque[tuple[float, Array]] = deque()  # t and shift (2,) px of the middle
-        self._squares, self._count = 0.0, 0
-        self._place = np.zeros(2)  # px: where the middle was when it was last said to have moved
-        self.moves: list[dict[str, float]] = []
-        self.lost: list[list[float]] = []  # first and last t (s) of stretches in which the scene was not found
-        self._gap: list[float] | None = None  # the present one
+        self._lost = False
 
     def steadied(self, frame: Frame) -> Frame | None:
         """The frame as the camera at rest sees it, as bright as there, None where the scene cannot be found in it."""
         frame = self._levelled(frame)
-        if self._unchanged < QUIET_FRAMES or frame.index % LOOK_EVERY == 0 or self._gap is not None:
+        if self._unchanged < QUIET_FRAMES or frame.index % LOOK_EVERY == 0 or self._lost:
             found = self._steady.register(frame.image)
+            self._lost = found is None
             if found is None:
-                self._miss(frame.t)
+                self._unchanged = 0
+                self.log.miss(frame.t)
                 return None
-            self._gap = None
             quiet = self._steady.shift(found @ np.linalg.inv(self._motion)) < 2 * STILL_PX
             self._unchanged = self._unchanged + 1 if quiet else 0
             self._motion = found
-            self._judge(frame.t)
+            self.log.note(frame.t, moved(found, self._steady.middle) - self._steady.middle)
         if self._steady.shift(self._motion) < STILL_PX:
             return frame
-        self._frames.append(frame.index)
-        self._entries.extend(self._motion.ravel())
         return replace(frame, image=self._steady.laid_back(frame.image, self._motion), image_from_rest=self._motion)
 
     def _levelled(self, frame: Frame) -> Frame:
         gain = self._exposure.gain(frame.image)
-        self._gains = min(self._gains[0], float(gain.min())), max(self._gains[1], float(gain.max()))
+        self.log.note_gain(gain)
         image = levelled(frame.image, gain)
         return frame if image is frame.image else replace(frame, image=image)
 
-    def image_from_rest(self, frame: int) -> Array | None:
-        """Where (3, 3) px the camera looked in a frame, None where it was at rest."""
-        k = bisect_left(self._frames, frame)
-        if k == len(self._frames) or self._frames[k] != frame:
-            return None
-        return np.array(self._entries[9 * k : 9 * k + 9], dtype=float).reshape(3, 3)
+
+class CameraLog:
+    """What a camera did that should not move: its shake, where it was moved, and when the scene was not found."""
+
+    def __init__(self) -> None:
+        self.moves: list[dict[str, float]] = []
+        self.lost: list[list[float]] = []  # first and last t (s) of stretches in which the scene was not found
+        self._gap: list[float] | None = None  # the present one
+        self._gains = 1.0, 1.0  # the least and the largest there were
+        self._recent: deque[tuple[float, Array]] = deque()  # t and shift (2,) px of the middle
+        self._squares, self._count = 0.0, 0
+        self._place = np.zeros(2)  # px: where the middle was when it was last said to have moved
+
+    def note_gain(self, gain: Array) -> None:
+        """Note by how much (3,) a picture was made brighter."""
+        self._gains = min(self._gains[0], float(gain.min())), max(self._gains[1], float(gain.max()))
+
+    def miss(self, t: float) -> None:
+        """Note that the scene was not found at t (s)."""
+        if self._gap is None:
+            self._gap = [t, t]
+            self.lost.append(self._gap)
+        self._gap[1] = t
+
+    def note(self, t: float, shift: Array) -> None:
+        """Note that the scene was found at t (s), its middle shifted (2,) px."""
+        self._gap = None
+        self._recent.append((t, shift))
+        while self._recent[0][0] < t - SETTLED_S:
+            self._recent.popleft()
+        recent = np.array([each for _, each in self._recent])
+        place = np.median(recent, axis=0)
+        # of the middle, not of the mean: a knock is no shake
+        self._squares += float(np.sum((MAD * np.median(np.abs(recent - place), axis=0)) ** 2)) / 2
+        self._count += 1
+        shake = np.sqrt(self._squares / self._count)
+        way = float(np.hypot(*(place - self._place)))
+        there = np.hypot(*(recent - place).T) < way / 2
+        if (
+            way > max(MOVED_PX, MOVED_SHAKES * shake)
+            and there.mean() > STAYS
+            and t - self._recent[0][0] > 0.8 * SETTLED_S
+        ):
+            self.moves.append({"t": round(self._recent[int(np.argmax(there))][0], 3), "px": round(way, 2)})
+            self._place = place
 
     def was_lost(self, t: float) -> bool:
         """Whether the scene could not be found at t (s)."""
@@ -107,30 +139,22 @@ class CameraWatch:
             )
         return said
 
-    def _miss(self, t: float) -> None:
-        if self._gap is None:
-            self._gap = [t, t]
-            self.lost.append(self._gap)
-        self._gap[1] = t
-        self._unchanged = 0
 
-    def _judge(self, t: float) -> None:
-        shift = moved(self._motion, self._steady.middle) - self._steady.middle
-        self._recent.append((t, shift))
-        while self._recent[0][0] < t - SETTLED_S:
-            self._recent.popleft()
-        recent = np.array([each for _, each in self._recent])
-        place = np.median(recent, axis=0)
-        # of the middle, not of the mean: a knock is no shake
-        self._squares += float(np.sum((MAD * np.median(np.abs(recent - place), axis=0)) ** 2)) / 2
-        self._count += 1
-        shake = np.sqrt(self._squares / self._count)
-        way = float(np.hypot(*(place - self._place)))
-        there = np.hypot(*(recent - place).T) < way / 2
-        if (
-            way > max(MOVED_PX, MOVED_SHAKES * shake)
-            and there.mean() > STAYS
-            and t - self._recent[0][0] > 0.8 * SETTLED_S
-        ):
-            self.moves.append({"t": round(self._recent[int(np.argmax(there))][0], 3), "px": round(way, 2)})
-            self._place = place
+class Motions:
+    """Where the camera looked in the frames in which it was not at rest; they come in order, 44 bytes each."""
+
+    def __init__(self) -> None:
+        self._frames, self._entries = array("q"), array("f")  # and 9 numbers for each
+
+    def note(self, frame: Frame) -> None:
+        """Remember where the camera looked in a frame."""
+        if frame.image_from_rest is not None:
+            self._frames.append(frame.index)
+            self._entries.extend(frame.image_from_rest.ravel())
+
+    def image_from_rest(self, frame: int) -> Array | None:
+        """Where (3, 3) px the camera looked in a frame, None where it was at rest."""
+        k = bisect_left(self._frames, frame)
+        if k == len(self._frames) or self._frames[k] != frame:
+            return None
+        return np.array(self._entries[9 * k : 9 * k + 9], dtype=float).reshape(3, 3)

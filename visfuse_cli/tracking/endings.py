@@ -5,11 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from visfuse_cli.maths.cameras import ground_scale, project
-from visfuse_cli.records import Array, GroundCamera
+from visfuse_cli.records import Array, Boxes, GroundCamera
 from visfuse_cli.tracking import dynamics as dynamics_tools
 from visfuse_cli.tracking.association import footprint_overlap
 from visfuse_cli.tracking.dynamics import Dynamics
-from visfuse_cli.tracking.evidence import Boxes
 from visfuse_cli.tracking.hypotheses import LEAST_OPEN
 from visfuse_cli.tracking.settings import LifeSettings
 from visfuse_cli.tracking.targets import Track

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Protocol
 
 import cv2
@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from visfuse_cli.maths.assignment import assign
-from visfuse_cli.records import Array, GroundCamera, Image, Region
+from visfuse_cli.records import Array, Boxes, GroundCamera, Image, Region
 from visfuse_cli.tracking.association import overlap, region_boxes
 from visfuse_cli.vision import contour, regions, wireframe
 from visfuse_cli.vision.contour import Fill, Look, Sight
@@ -19,7 +19,6 @@ from visfuse_cli.vision.points import Corners
 from visfuse_cli.vision.regions import Band, Cleaned
 from visfuse_cli.vision.wireframe import Outlines
 
-Boxes = tuple[Array, Array]  # pose (N, 3) and size (N, 3)
 MARGIN = 0.08  # of a vehicle's width in the picture: what lies closer to it is its own
 LEAST_IOU = 0.2  # of a detection and the box expected there
 
@@ -58,7 +57,7 @@ class LabelEvidence:
         speck_m: float,
         smallest_m: float,
         cleaned: Cleaned | None = None,
-        corners: Callable[[], Corners] | None = None,
+        corners: Corners | None = None,
         sunny: bool = False,
     ) -> None:
         self._labels, self._cleaned, self._corners, self._past = Labels(labels), cleaned, corners, False
@@ -73,7 +72,7 @@ class LabelEvidence:
         self._past = True
 
     def corners(self) -> Corners | None:
-        return None if self._corners is None else self._corners()
+        return self._corners
 
     def look(self, pose: Array, size: Array, reach: Array) -> Look:
         code = np.arange(1, len(pose) + 1)

@@ -12,7 +12,7 @@ import numpy as np
 from visfuse_cli.maths.assignment import gate_size
 from visfuse_cli.maths.cameras import project
 from visfuse_cli.maths.gaussian import mahalanobis
-from visfuse_cli.records import Array, GroundCamera
+from visfuse_cli.records import Array, Boxes, GroundCamera
 from visfuse_cli.records import Region as ImageRegion
 from visfuse_cli.tracking import dynamics as dynamics_tools
 from visfuse_cli.tracking import endings, measure, texture
@@ -20,7 +20,7 @@ from visfuse_cli.tracking.association import footprint_overlap
 from visfuse_cli.tracking.births import Nursery
 from visfuse_cli.tracking.dynamics import Dynamics, Prediction, Step
 from visfuse_cli.tracking.endings import ONE_PLACE, trimmed
-from visfuse_cli.tracking.evidence import Boxes, Evidence
+from visfuse_cli.tracking.evidence import Evidence
 from visfuse_cli.tracking.hypotheses import LEAST_OPEN, Guess, gains
 from visfuse_cli.tracking.joining import WAIT_S, goes_on, lasting
 from visfuse_cli.tracking.lookback import Recent

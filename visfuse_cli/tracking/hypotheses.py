@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from visfuse_cli.maths import homography
 from visfuse_cli.maths.cameras import project
-from visfuse_cli.records import Array, GroundCamera, Region
+from visfuse_cli.records import Array, Boxes, GroundCamera, Region
 from visfuse_cli.tracking import measure
 from visfuse_cli.tracking.association import footprint_overlap
-from visfuse_cli.tracking.evidence import Boxes, Evidence, probe_each
+from visfuse_cli.tracking.evidence import Evidence, probe_each
 from visfuse_cli.tracking.settings import SizePrior, TrackerSettings
 from visfuse_cli.vision import wireframe
 from visfuse_cli.vision.contour import Look

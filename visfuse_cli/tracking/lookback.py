@@ -10,11 +10,11 @@ import numpy as np
 from visfuse_cli.maths.assignment import gate_size
 from visfuse_cli.maths.cameras import ground_scale, project
 from visfuse_cli.maths.gaussian import mahalanobis
-from visfuse_cli.records import Array, GroundCamera
+from visfuse_cli.records import Array, Boxes, GroundCamera
 from visfuse_cli.tracking import dynamics as dynamics_tools
 from visfuse_cli.tracking import hypotheses, measure
 from visfuse_cli.tracking.dynamics import Dynamics
-from visfuse_cli.tracking.evidence import Boxes, Evidence, probe_each
+from visfuse_cli.tracking.evidence import Evidence, probe_each
 from visfuse_cli.tracking.hypotheses import Guess
 from visfuse_cli.tracking.settings import TrackerSettings
 from visfuse_cli.tracking.targets import Sample

@@ -9,8 +9,9 @@ from pydantic import Field, field_validator, model_validator
 
 from visfuse_cli.config import Section
 from visfuse_cli.maths.polygons import Polygon, surrounding
-from visfuse_cli.tracking.foreground import BackgroundSettings, RegionSettings
+from visfuse_cli.tracking.foreground import RegionSettings
 from visfuse_cli.tracking.lanes import LaneSettings
+from visfuse_cli.tracking.lookout import BackgroundSettings
 from visfuse_cli.tracking.privacy import PrivacySettings
 from visfuse_cli.tracking.settings import TrackerSettings
 from visfuse_cli.tracking.verdict import SpeedSettings

@@ -8,9 +8,9 @@ import numpy as np
 from visfuse_cli.maths import homography
 from visfuse_cli.maths.angles import wrap
 from visfuse_cli.maths.cameras import ground_scale, project
-from visfuse_cli.records import Array, GroundCamera
+from visfuse_cli.records import Array, Boxes, GroundCamera
 from visfuse_cli.tracking import hypotheses, measure
-from visfuse_cli.tracking.evidence import Boxes, LabelEvidence
+from visfuse_cli.tracking.evidence import LabelEvidence
 from visfuse_cli.tracking.hypotheses import LARGER, SHADOW_ONLY, UNMOVED, Guess
 from visfuse_cli.tracking.settings import TrackerSettings
 from visfuse_cli.vision import wireframe

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from visfuse_cli.maths.cameras import project
-from visfuse_cli.maths.percentiles import median
+from visfuse_cli.maths.medians import median
 from visfuse_cli.records import Array, GroundCamera, Image
 from visfuse_cli.vision import contour
 from visfuse_cli.vision.background import FOREGROUND, SHADOW

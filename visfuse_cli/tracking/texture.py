@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from visfuse_cli.maths.cameras import project
-from visfuse_cli.maths.percentiles import median
+from visfuse_cli.maths.medians import median
 from visfuse_cli.maths.polygons import distance
 from visfuse_cli.records import Array, GroundCamera
 from visfuse_cli.vision import wireframe

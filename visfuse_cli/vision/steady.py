@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from visfuse_cli.maths.percentiles import median
+from visfuse_cli.maths.medians import median
 from visfuse_cli.records import Array, Image
 from visfuse_cli.vision.exposure import Exposure, levelled
 

@@ -5,7 +5,9 @@ frames -> steady -> background -> regions -> tracker (predict, measure, update) 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -101,9 +103,9 @@ def run(request: RunRequest) -> RunResult:
             run_.warn(doubt)
         next_id = 1
         for path in job.clips:
-            with _open(path, request) as source:
+            with (footage := _footage(path, request))() as source:
                 camera = _camera(job.ground, source, job.config)
-                clip = Clip(path.name, source, camera, job.config, job.boxes)
+                clip = Clip(path.name, source, footage, camera, job.config, job.boxes)
                 next_id = follow(clip, run_, spool, results, next_id, path.name if job.several else None)
             if run_.stopped_by is not None:
                 break
@@ -135,7 +137,7 @@ def _read(request: RunRequest) -> _Job:
 def _check(path: Path, job: _Job, results: Findings) -> None:
     """Open one recording, compare it with the calibration, and note when it began."""
     clock = job.config.clock
-    with _open(path, job.request) as source:
+    with _footage(path, job.request)() as source:
         _check_size(source, job.ground, path)
         _camera(job.ground, source, job.config)
         moment, doubt = began(path, clock.pattern, clock.zone, source.creation_time)
@@ -165,7 +167,7 @@ def _report(job: _Job, results: Findings, lanes: tuple[Polygon, ...], run_: Run,
         {
             "summary": summary,
             "began_utc": {name: utc(moment, 0.0) or None for name, moment in results.began.items()},
-            "camera": {name: watch.report() for name, watch in results.watches.items()},
+            "camera": {name: log.report() for name, log in results.cameras.items()},
             "crs": None if job.ground.reference is None else asdict(job.ground.reference),
             "sun": results.suns,
             "lanes": lanes,
@@ -200,8 +202,9 @@ def _camera(ground: GroundMap, source: VideoSource, config: SpeedConfig) -> Grou
         raise UsageError(f"target.height: {problem}") from problem
 
 
-def _open(path: Path, request: RunRequest) -> VideoSource:
-    return open_source(path, fps=request.config.video.fps, start=request.start, end=request.end)
+def _footage(path: Path, request: RunRequest) -> Callable[[], VideoSource]:
+    """Opens a recording, here or in another process."""
+    return partial(open_source, path, fps=request.config.video.fps, start=request.start, end=request.end)
 
 
 def _check_size(source: VideoSource, ground: GroundMap, path: Path) -> None:
@@ -240,15 +243,16 @@ def _annotate(
     """Write the annotated video of one clip from a second decode; a stop request ends it early and readable."""
     config: SpeedConfig = request.config
     places = {f"lane {number}": lane for number, lane in enumerate(lanes, start=1)} | {"region": config.region}
-    with _open(path, request) as source:
+    with _footage(path, request)() as source:
         camera = _camera(ground, source, request.config)
         records = (spool.read(identity) for _, identity in sorted(results.ledger.drawn[path.name]))
-        watch, strangers = results.watches[path.name], results.strangers[path.name]
+        name = path.name
+        motions, log, strangers = results.motions[name], results.cameras[name], results.strangers[name]
         with (
             VideoWriter(out, source.width, source.height, source.nominal_rate) as video,
             run_.background(video) as sink,
         ):
-            for frame in annotate(run_.frames(source), records, camera, config, watch, strangers, places):
+            for frame in annotate(run_.frames(source), records, camera, config, motions, log, strangers, places):
                 sink.write(frame.image, frame.t)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from datetime import datetime
 from typing import Any
@@ -10,28 +10,28 @@ from typing import Any
 import cv2
 import numpy as np
 
+from visfuse_cli.elsewhere import ahead, apart
 from visfuse_cli.files.spool import TrackSpool
 from visfuse_cli.files.video import VideoSource
-from visfuse_cli.pipeline import Run, ahead, foreseen, helper
-from visfuse_cli.records import Array, Frame, GroundCamera, Image, TimeAudit
-from visfuse_cli.threads import give_back, thread_cap
-from visfuse_cli.tracking.camera_watch import CameraWatch
-from visfuse_cli.tracking.elsewhere import HandOver
+from visfuse_cli.pipeline import Run
+from visfuse_cli.records import Array, GroundCamera, Image, TimeAudit
+from visfuse_cli.threads import give_back
+from visfuse_cli.tracking.camera_watch import CameraLog, Motions
 from visfuse_cli.tracking.foreground import Detections, Detector, MovingRegions
 from visfuse_cli.tracking.ground import GroundTracker
 from visfuse_cli.tracking.headlights import Headlights
 from visfuse_cli.tracking.ledger import Ledger, Recording
+from visfuse_cli.tracking.lookout import Comparing, look_out
 from visfuse_cli.tracking.options import SpeedOptions
 from visfuse_cli.tracking.privacy import Strangers
 from visfuse_cli.tracking.targets import Abandoned, Track
 from visfuse_cli.tracking.zones import Region
 from visfuse_cli.vision.empty import empty_picture
-from visfuse_cli.vision.points import MovingPoints
 from visfuse_cli.vision.steady import at_rest
 
 WARMUP_PICTURES = 31
 TOGETHER = 500  # frames of tracks that have ended wait for one another: settling them at once takes less time
-FORESEEN = 3  # frames that are compared with the background before their turn
+FORESEEN = 3  # frames that are looked at before their turn
 STEADIED_PX = 0.3  # what is left of a shake between two pictures, at most
 
 
@@ -43,7 +43,8 @@ class Findings:
     audits: dict[str, TimeAudit] = field(default_factory=dict)
     began: dict[str, datetime | None] = field(default_factory=dict)
     doubts: list[str] = field(default_factory=list)  # about times of day
-    watches: dict[str, CameraWatch] = field(default_factory=dict)
+    cameras: dict[str, CameraLog] = field(default_factory=dict)
+    motions: dict[str, Motions] = field(default_factory=dict)
     suns: dict[str, dict[str, Any] | None] = field(default_factory=dict)
     strangers: dict[str, Strangers] = field(default_factory=dict)
 
@@ -54,6 +55,7 @@ class Clip:
 
     name: str
     source: VideoSource
+    footage: Callable[[], VideoSource]  # opens it once more, in another process
     camera: GroundCamera
     config: SpeedOptions
     boxes: dict[int, Array] | None
@@ -61,37 +63,45 @@ class Clip:
 
 def follow(clip: Clip, run_: Run, spool: TrackSpool, findings: Findings, first_id: int, label: str | None) -> int:
     """Follow everything in one clip; returns the next free id."""
-    # One core belongs to the tracker: a pool as large as the machine would wait for it, spinning.
-    cv2.setNumThreads(thread_cap() or max(1, cv2.getNumberOfCPUs() - 1))
+    cv2.setNumThreads(1)  # the other cores belong to the lookout
     findings.ledger.drawn[clip.name] = []
     strangers = findings.strangers[clip.name] = Strangers(clip.camera)
-    with helper() as compare, helper() as follow_corners:
+    motions = findings.motions[clip.name] = Motions()
+    with apart() as begin:
         with run_.stage("warm up"):
             empty = _empty_scene(clip.source, clip.config.background.warmup_s)
             give_back()
-            watch = findings.watches[clip.name] = CameraWatch(empty)
-            look, lamps = _detector(clip, empty, compare, follow_corners), Headlights(empty, clip.camera)
+            detector, lamps = _detector(clip), Headlights(empty, clip.camera)
         tracker = GroundTracker(clip.camera, clip.config, first_id)
-        of = Recording(clip.name, label, clip.camera, findings.began[clip.name], watch.image_from_rest)
+        of = Recording(clip.name, label, clip.camera, findings.began[clip.name], motions.image_from_rest)
         settling = _Settling(of, tracker, lamps, run_, spool, findings.ledger)
-        for frame in foreseen(_steadied(clip.source, watch, run_), look.foresee, FORESEEN):
+        lookout = begin(look_out, clip.footage, clip.camera, empty, _comparing(clip), lag=FORESEEN)
+        for seen in run_.told(lookout, clip.source.frame_count):
+            run_.count("frames")
+            if seen is None:
+                lookout.answer(None)
+                continue
+            frame = seen.frame
+            motions.note(frame)
             tracker.predict(frame.t)
             with run_.stage("detect"):
-                evidence = look.evidence(frame, tracker.expected())
+                evidence = detector.evidence(seen, tracker.expected())
             with run_.stage("track"):
                 ended = tracker.update(frame.index, evidence)
+                lookout.answer(tracker.boxes())
                 if clip.config.privacy.blur:
                     strangers.add(frame.index, tracker.unexplained)
                 lamps.look(frame, tracker.tracks, tracker.headings())
             with run_.stage("conclude"):
                 settling.take(*ended)
             with run_.stage("learn"):
-                look.learn(frame, tracker)
+                detector.learn(frame.t, tracker)
         settling.take(*tracker.finish(), last=True)
+        audit, log = lookout.finish()
     give_back()
-    findings.suns[clip.name] = look.report()
-    audit = findings.audits[clip.name] = clip.source.audit()
-    for warning in (*audit.warnings, *watch.warnings(clip.name)):
+    findings.suns[clip.name] = detector.report()
+    findings.audits[clip.name], findings.cameras[clip.name] = audit, log
+    for warning in (*audit.warnings, *log.warnings(clip.name)):
         run_.warn(warning)
     return tracker.next_id
 
@@ -103,25 +113,20 @@ def _empty_scene(source: VideoSource, warmup_s: float) -> Image:
     return empty_picture(pictures, min(STEADIED_PX, shake))
 
 
-def _steadied(source: VideoSource, watch: CameraWatch, run_: Run) -> Iterator[Frame]:
-    """The frames in which the scene is recognised, as the camera at rest sees them."""
-    for frame in run_.prepared(source, watch.steadied):
-        run_.count("frames")
-        if frame is not None:
-            yield frame
-
-
-def _detector(clip: Clip, empty: Image, compare: HandOver, follow_corners: HandOver) -> Detector:
+def _detector(clip: Clip) -> Detector:
     config = clip.config
-    region = Region(np.array(config.region)) if config.region else None
     if clip.boxes is not None:
-        return Detections(clip.camera, clip.boxes, region)
+        return Detections(clip.camera, clip.boxes, Region(np.array(config.region)) if config.region else None)
+    return MovingRegions(clip.camera, config.background.shadow_ratio, config.regions, config.target.smallest)
+
+
+def _comparing(clip: Clip) -> Comparing | None:
+    config = clip.config
+    if clip.boxes is not None:
+        return None
+    watched = Region(np.array(config.region)).picture(clip.camera) if config.region else None
     # People turn and bend: their corners tell little.
-    corners = MovingPoints(clip.camera) if config.target.motion == "bicycle" else None
-    smallest = config.target.smallest
-    return MovingRegions(
-        clip.camera, config.background, config.regions, smallest, empty, region, corners, compare, follow_corners
-    )
+    return Comparing(config.background, config.regions.speck, watched, corners=config.target.motion == "bicycle")
 
 
 def sampled(source: VideoSource, warmup_s: float) -> Iterator[Any]:
