@@ -1,6 +1,7 @@
 """A generator in a process of its own: order, lag, shared pictures, errors, and what happens when either side dies."""
 
 import os
+import resource
 import signal
 import subprocess
 import sys
@@ -117,6 +118,17 @@ def test_what_finds_no_room_goes_along(elsewhere):
     with apart() as begin:
         sizes = [(array.shape, int(array[0, 0])) for array in _answered(begin(growing, lag=1))]
     assert sizes == [((400, 400), 400), ((100, 100), 100), ((500, 500), 500)]
+
+
+def test_without_room_at_all_the_pictures_go_along(elsewhere):
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, before[1]))
+    try:
+        with apart() as begin:
+            sums = [int(array.sum()) for array in _answered(begin(growing, lag=1))]
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert sums == [400**3, 100**3, 500**3]
 
 
 def _answered(exchange):

@@ -290,8 +290,8 @@ class _Slots:
         self._shared: mmap.mmap | None = None
 
     def put(self, item: Any) -> tuple[bytes, list[tuple[int, int]]]:
-        """An item without its large arrays, and where (first byte, last) these lie; with them where they are larger
-        than those of the first item."""
+        """An item without its large arrays, and where (first byte, last) these lie; with them where they find no room,
+        which is made for those of the first item."""
         large: list[memoryview] = []
 
         def small(buffer: pickle.PickleBuffer) -> bool:
@@ -302,12 +302,13 @@ class _Slots:
 
         data = pickle.dumps(item, protocol=5, buffer_callback=small)
         ends = list(itertools.accumulate((-(-raw.nbytes // ALIGNED) * ALIGNED for raw in large), initial=0))
-        if large and self._shared is None:
-            self._size = ends[-1]
-            os.ftruncate(self._memory, self._size * self._count)
-            self._shared = mmap.mmap(self._memory, self._size * self._count)
         if not large:
             return data, []
+        if not self._size:
+            self._size = ends[-1]
+            with suppress(OSError):  # no room, or none allowed
+                os.ftruncate(self._memory, self._size * self._count)
+                self._shared = mmap.mmap(self._memory, self._size * self._count)
         if self._shared is None or ends[-1] > self._size:
             return pickle.dumps(item, protocol=5), []
         first, self._used = self._used % self._count * self._size, self._used + 1
