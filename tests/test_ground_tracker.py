@@ -65,6 +65,16 @@ def test_a_region_is_taken_for_the_class_that_it_is(name, size):
     assert gains[1] < guess.gain <= gains[0]
 
 
+def test_a_van_close_to_the_camera_is_found_beside_its_shadow():
+    pose, size = np.array([2.0, 11.0, 0.9]), np.array([5.4, 2.0, 2.3])
+    evidence = evidence_of(CAMERA, labels_of(CAMERA, [(pose, size)], [(pose - [0.3, 1.5, 0.0], size * [1, 1, 0.02])]))
+    (region,) = evidence.leftovers(*NOBODY)
+    guess = hypotheses.best_guess(CAMERA, TrackerSettings(), evidence, region, 0.9, NOBODY)
+    assert guess is not None
+    np.testing.assert_allclose(guess.pose[:2], pose[:2], atol=0.1)
+    np.testing.assert_allclose(guess.size, size, atol=0.1)
+
+
 def test_a_shadow_alone_is_taken_for_nothing():
     pose = np.array([2.0, 24.0, 1.4])
     evidence = evidence_of(CAMERA, labels_of(CAMERA, [], [(pose, CAR)]))

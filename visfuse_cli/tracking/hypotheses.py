@@ -20,6 +20,7 @@ from visfuse_cli.vision.contour import Look
 from visfuse_cli.vision.wireframe import BoxFit
 
 REACHES_PX = (24.0, 12.0, 6.0)  # how far around a hypothesis its border is looked for, coarse to fine
+LARGE_PX = 160.0  # a silhouette's side: around a larger one the border is looked for as much further
 BORDER_SEEN, AREA_MOVED = 0.6, 0.6  # shares of its border and its area that must be found
 CLEAR = 0.4  # share of its border that must have background outside: a window of a grey car has paint
 SLIM_SEEN, SLIM_CLEAR = 0.75, 0.6  # the same of what is slim: a part of a vehicle is like it
@@ -90,11 +91,12 @@ def refined(
     priors = [measure.prior_arrays(prior) for prior in classes]
     mean, sigma = (np.stack([pair[k] for pair in priors])[which] for k in (0, 1))
     size = mean
+    times = _times_as_far(camera, pose, size)
     for reach in REACHES_PX[:-1]:
-        outlines = evidence.outlines(pose, size, np.full(len(pose), reach), taken)
+        outlines = evidence.outlines(pose, size, reach * times, taken)
         fit = measure.fit_poses(camera, outlines, pose, mean, sigma, settings.pose, HEADING_SIGMA)
         pose, size = _moved(fit, pose, size)
-    look = evidence.probe(pose, size, np.full(len(pose), REACHES_PX[-1]), taken)
+    look = evidence.probe(pose, size, REACHES_PX[-1] * times, taken)
     fit = measure.fit_poses(camera, look.outlines, pose, mean, sigma, settings.pose, HEADING_SIGMA)
     pose, size = _moved(fit, pose, size)
     usual = np.all(np.abs(size - mean) < UNUSUAL * sigma, axis=1)
@@ -118,6 +120,11 @@ def refined(
     return [Guess(classes[which[k]], pose[k], size[k], sigma[k], float(gain[k])) for k in np.flatnonzero(good)]
 
 
+def _times_as_far(camera: GroundCamera, pose: Array, size: Array) -> Array:
+    """How many times (N,) REACHES_PX the border of each box may be off: what is large in the picture is off by more."""
+    return np.asarray(np.maximum(1.0, np.sqrt(area_of(camera, pose, size)) / LARGE_PX))
+
+
 def _moved(fit: BoxFit, pose: Array, size: Array) -> tuple[Array, Array]:
     """Poses and sizes (N, 3) after a fit, as they were where it failed."""
     return np.where(fit.ok[:, None], fit.pose, pose), np.where(fit.ok[:, None], fit.size, size)
@@ -125,7 +132,7 @@ def _moved(fit: BoxFit, pose: Array, size: Array) -> tuple[Array, Array]:
 
 def gains(camera: GroundCamera, frames: Sequence[Evidence], pose: Array, size: Array, taken: list[Boxes]) -> Array:
     """How much (N,) N boxes explain, each in a frame of its own, as `Guess.gain`; NaN where one is hidden."""
-    look = probe_each(frames, pose, size, np.full(len(pose), REACHES_PX[-1]), taken)
+    look = probe_each(frames, pose, size, REACHES_PX[-1] * _times_as_far(camera, pose, size), taken)
     return _gain(look, area_of(camera, pose, size) * look.open)
 
 
