@@ -75,6 +75,23 @@ def test_a_van_close_to_the_camera_is_found_beside_its_shadow():
     np.testing.assert_allclose(guess.size, size, atol=0.1)
 
 
+def test_what_was_given_the_course_of_another_is_turned_round():
+    truth = drive([2.0, 20.0], [1.0, 10.0], np.arange(20) / FPS)
+    tracker = GroundTracker(CAMERA, TrackerSettings(life=LifeSettings(birth_scale=1e-3)))
+    for k, pose in enumerate(truth):
+        tracker.predict(k / FPS)
+        tracker.update(k, evidence_of(CAMERA, labels_of(CAMERA, [(pose, CAR)])))
+    turned, seen = float(truth[0, 2] + np.pi), tracker._recent[-1][2]
+    guess = hypotheses.best_guess(CAMERA, tracker.settings, seen, region_of([(truth[-1], CAR)]), turned, NOBODY)
+    assert guess is not None
+    track = tracker._nursery.grown(guess, np.array([-1.0, -10.0]), 1, tracker._recent, lambda _: NOBODY, [])
+    assert track is not None
+    off, angle = error(track, tracker, truth)
+    assert len(track.samples) == len(truth)
+    assert off.max() < 0.5
+    assert angle.max() < 0.1
+
+
 def test_a_shadow_alone_is_taken_for_nothing():
     pose = np.array([2.0, 24.0, 1.4])
     evidence = evidence_of(CAMERA, labels_of(CAMERA, [], [(pose, CAR)]))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -218,6 +218,10 @@ class Nursery:
         that it goes on from, whose number it has. None when it was hardly seen before."""
         camera, settings = self._camera, self._settings
         samples, pose = trace(camera, settings, self._dynamics, recent, taken_at, guess, velocity, beyond_doubt)
+        if settings.target.motion == "bicycle" and _ahead(pose) < -settings.life.confirm_m:
+            guess = replace(guess, pose=guess.pose + [0, 0, np.pi])  # it was given the course of another
+            velocity = (pose[-1, :2] - pose[0, :2]) / (samples[-1].t - samples[0].t)
+            samples, pose = trace(camera, settings, self._dynamics, recent, taken_at, guess, velocity, beyond_doubt)
         used = np.array([sample.measured for sample in samples], dtype=bool)
         if used.sum() < settings.life.confirm_frames or used.mean() < SEEN:
             return None
@@ -288,6 +292,11 @@ def _added(track: Track, tracks: list[Track], held: list[Track], next_id: int) -
     tracks.append(track)
     held[:] = [old for old in held if old.id != track.id]
     return max(next_id, track.id + 1)
+
+
+def _ahead(pose: Array) -> float:
+    """How far (m) a thing at poses (n, 3), one after another, gets the way it faces in the end."""
+    return float((pose[-1, :2] - pose[0, :2]) @ [np.cos(pose[-1, 2]), np.sin(pose[-1, 2])]) if len(pose) else 0.0
 
 
 def _seen(track: Track) -> float:
