@@ -13,7 +13,7 @@ from visfuse_cli.maths.cameras import project
 from visfuse_cli.records import Array, Boxes, GroundCamera, Region
 from visfuse_cli.tracking import measure
 from visfuse_cli.tracking.association import footprint_overlap
-from visfuse_cli.tracking.evidence import Evidence, probe_each
+from visfuse_cli.tracking.evidence import Evidence, LabelEvidence, probe_each
 from visfuse_cli.tracking.settings import SizePrior, TrackerSettings
 from visfuse_cli.vision import wireframe
 from visfuse_cli.vision.contour import Look
@@ -28,6 +28,7 @@ FOOT_SEEN = 0.5  # share of its border on the ground that must be found: a part 
 LEAST_OPEN = 0.2  # of a box in view to measure it
 OPEN, SHOWN = 0.5, 0.45  # of its area that must be in view, and of all of its border that must be found
 ONE_PLACE = 0.25  # of a footprint that may lie in another's
+LEAST_PAINT, HOPEFUL = 0.05, 0.25  # shares of paint in, and of border found around, a box that is worth another look
 PART = 0.3  # how much more of these is wanted of a box that explains next to nothing
 SOLID, LARGE_M = 0.75, 3.0  # share of paint in, and length of, what may stand amidst shadows: no window is like it
 SHADOW_ONLY, UNMOVED = 0.3, 0.5  # what a pixel of shadow, and one that did not move, counts against one of paint
@@ -68,8 +69,11 @@ def best_guess(
     boxes = (region.box, region.around)
     means = [measure.prior_arrays(prior)[0] for prior in settings.target.classes]
     starts = [np.concatenate([_aligned(camera, box, heading, mean) for box in boxes]) for mean in means]
-    which = np.repeat(np.arange(len(means)), [len(start) for start in starts])
-    guesses = refined(camera, settings, evidence, which, np.concatenate(starts), region.around_area, taken, convincing)
+    which, pose = np.repeat(np.arange(len(means)), [len(start) for start in starts]), np.concatenate(starts)
+    if isinstance(evidence, LabelEvidence):
+        painted = evidence.fill(pose, np.stack(means)[which], taken).paint > LEAST_PAINT
+        which, pose = which[painted], pose[painted]
+    guesses = refined(camera, settings, evidence, which, pose, region.around_area, taken, convincing)
     return max(guesses, key=lambda guess: guess.gain, default=None)
 
 
@@ -90,19 +94,28 @@ def refined(
     classes = settings.target.classes
     priors = [measure.prior_arrays(prior) for prior in classes]
     mean, sigma = (np.stack([pair[k] for pair in priors])[which] for k in (0, 1))
-    size = mean
+    if not len(which):
+        return []
+    size, moving = mean, np.broadcast_to(np.asarray(around_area, dtype=float), len(pose))
     times = _times_as_far(camera, pose, size)
     for reach in REACHES_PX[:-1]:
         outlines = evidence.outlines(pose, size, reach * times, taken)
         fit = measure.fit_poses(camera, outlines, pose, mean, sigma, settings.pose, HEADING_SIGMA)
         pose, size = _moved(fit, pose, size)
+        if convincing:  # most have nothing around them that could be their border, and never will convince
+            hopeful = fit.ok & (outlines.tangent | (outlines.valid.mean(axis=1) > HOPEFUL))
+            if not hopeful.any():
+                return []
+            which, pose, size, mean, sigma, moving, times = (
+                each[hopeful] for each in (which, pose, size, mean, sigma, moving, times)
+            )
     look = evidence.probe(pose, size, REACHES_PX[-1] * times, taken)
     fit = measure.fit_poses(camera, look.outlines, pose, mean, sigma, settings.pose, HEADING_SIGMA)
     pose, size = _moved(fit, pose, size)
     usual = np.all(np.abs(size - mean) < UNUSUAL * sigma, axis=1)
     area = area_of(camera, pose, size) * look.open
     # A window of a grey car looks like a small vehicle: what explains little of all that moves must be seen clearly.
-    doubt = 1 - np.clip(area * look.moved / np.maximum(around_area, 1.0), 0, 1)
+    doubt = 1 - np.clip(area * look.moved / np.maximum(moving, 1.0), 0, 1)
     clear = (look.border > BORDER_SEEN + PART * doubt) & (look.clear > CLEAR + PART * doubt)
     clear |= (look.border > BORDER_SEEN + PART / 2) & (look.paint > SOLID) & (mean[:, 0] > LARGE_M)
     stands = (
