@@ -16,6 +16,8 @@ FOREGROUND, SHADOW = 255, 127
 NOISE = 3.0  # grey levels a channel, of what a picture and its background may differ by where a ghost was
 STILL_S = 1.0  # s that a ghost stands before it is looked for
 KNN_FIRST, KNN_LOOKING = (0.5,) * 10, 1e-9  # rates: it fills its samples one by one, and divides by the logarithm
+MIXTURES = 3  # of MOG2 in each pixel: a place seldom has more than two looks, and each takes time to read
+LEAST_RATE = 1 / 64  # of the picture each time: less would be lost in rounding
 LEARN_EVERY = 4  # frames: learning costs as much as looking
 
 
@@ -31,6 +33,7 @@ class Background:
         self._first: tuple[float, ...]  # rates at which the first picture is learnt
         if kind == "mog2":
             model, self._first = cv2.createBackgroundSubtractorMOG2(500, threshold, True), (1.0,)
+            model.setNMixtures(MIXTURES)
         elif kind == "kalman":
             model, self._first = KalmanBackground(threshold), (1.0,)
         else:
@@ -92,7 +95,8 @@ class Background:
             image = image.copy()
             cv2.copyTo(self._picture, mask, image)
         self._model.apply(image, learningRate=rate)
-        self._picture = cv2.addWeighted(image, max(rate, 1 / 64), self._picture, 1 - max(rate, 1 / 64), 0)
+        share = max(rate, LEAST_RATE)
+        self._picture = cv2.addWeighted(image, share, self._picture, 1 - share, 0)
 
     def _forget_ghosts(self, image: Image, t: float, now: Image | None) -> None:
         if self._compared is not None and t - self._compared[0] < STILL_S:
