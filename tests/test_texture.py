@@ -79,7 +79,7 @@ def test_a_box_that_the_corners_on_it_leave_goes_with_them(seconds):
         (pose,), _ = tracker.expected()
         points = on_near_side(pose, CAR, np.random.default_rng(frame))
         corners = Corners(moves_of(points, np.array([0.0, 4.0])), nowhere)
-        seen = LabelEvidence(labels, CAMERA, regions.bands(CAMERA), 0.3, 0.12, 0.5, corners=lambda told=corners: told)
+        seen = LabelEvidence(labels, CAMERA, regions.bands(CAMERA), 0.3, 0.12, 0.5, corners=corners)
         tracker.update(frame, seen)
     (left,) = (each for each in tracker.tracks if each.id == 1)
     speed = dynamics.planar(left.steps[-1].posterior.mean)[0][3]
