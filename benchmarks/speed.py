@@ -15,6 +15,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -31,6 +32,7 @@ from visfuse_cli.files.video_writer import VideoWriter  # noqa: E402
 from visfuse_cli.vision.background import Background  # noqa: E402
 
 PAIRS = 5
+LOOK_S = 0.05  # between looks at the memory
 SEED = {"free-flow": 1, "dense": 0}
 VISFUSE = (sys.executable, "-m", "visfuse_cli")
 BARE = """
@@ -47,7 +49,7 @@ while True:
 
 @dataclass(frozen=True)
 class Usage:
-    """What a process took: s on the wall, s of processor time, peak memory in MB."""
+    """What a process and its children took: s on the wall, s of processor time, peak memory in MB."""
 
     wall: float
     cpu: float
@@ -77,10 +79,29 @@ def process(*command: str) -> Usage:
     """Run a command."""
     begun = time.perf_counter()
     child = subprocess.Popen(command, stdout=subprocess.DEVNULL, env=os.environ | THREADS)
-    _, status, usage = os.wait4(child.pid, 0)
+    peak, ended = 0.0, 0
+    while not ended:
+        time.sleep(LOOK_S)
+        peak = max(peak, _held(child.pid) + sum(_held(int(pid)) for pid in _children(child.pid)))
+        ended, status, usage = os.wait4(child.pid, os.WNOHANG)
     if status:
         raise SystemExit(f"{' '.join(command)}: failed")
-    return Usage(time.perf_counter() - begun, usage.ru_utime + usage.ru_stime, usage.ru_maxrss / 1e3)
+    return Usage(time.perf_counter() - begun, usage.ru_utime + usage.ru_stime, peak)
+
+
+def _children(pid: int) -> list[str]:
+    with suppress(OSError):
+        return Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
+    return []
+
+
+def _held(pid: int) -> float:
+    """MB of memory that a process holds; what it shares with another counts half for each. 0 where it has ended."""
+    with suppress(OSError):
+        for line in Path(f"/proc/{pid}/smaps_rollup").read_text().splitlines():
+            if line.startswith("Pss:"):
+                return int(line.split()[1]) / 1e3
+    return 0.0
 
 
 def scene(kept: Path, kind: str, length: int) -> Path:
