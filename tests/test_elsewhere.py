@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from visfuse_cli.elsewhere import LARGE, Enough, apart
-from visfuse_cli.errors import InputError
+from visfuse_cli.errors import InputError, VisfuseError
 
 LAG = 2
 
@@ -152,7 +152,7 @@ def test_a_process_that_is_killed_is_told_of_in_one_line(elsewhere):
     with apart() as begin:
         exchange = iter(begin(waiting, lag=0))
         os.kill(next(exchange), signal.SIGKILL)
-        with pytest.raises(RuntimeError, match=r"has ended with code -9$"):
+        with pytest.raises(VisfuseError, match=r"was ended, code -9; is memory short\?$"):
             next(exchange)
 
 

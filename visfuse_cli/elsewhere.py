@@ -223,7 +223,7 @@ class _Other:
             kind, data, extents = pickle.loads(self._line.recv_bytes())
         except NOBODY:
             code = self._process.wait()
-            raise RuntimeError(f"the process that looks at the footage has ended with code {code}") from None
+            raise VisfuseError(f"the process that reads the footage was ended, code {code}; is memory short?") from None
         item = pickle.loads(data, buffers=[self._view(*extent) for extent in extents])
         if kind == "problem":
             raise item
