@@ -32,7 +32,7 @@ from visfuse_cli.files.video_writer import VideoWriter  # noqa: E402
 from visfuse_cli.vision.background import Background  # noqa: E402
 
 PAIRS = 5
-LOOK_S = 0.05  # between looks at the memory
+LOOK_S = 0.5  # between looks at the memory, which hold the process up
 SEED = {"free-flow": 1, "dense": 0}
 VISFUSE = (sys.executable, "-m", "visfuse_cli")
 BARE = """
