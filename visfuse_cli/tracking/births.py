@@ -20,7 +20,7 @@ from visfuse_cli.tracking.joining import part_before, places
 from visfuse_cli.tracking.lookback import Recent, trace
 from visfuse_cli.tracking.scan import headings, scan, velocity_of
 from visfuse_cli.tracking.settings import TrackerSettings
-from visfuse_cli.tracking.targets import Abandoned, Sample, Track, velocity_at_start
+from visfuse_cli.tracking.targets import REVERSES, Abandoned, Sample, Track, velocity_at_start
 from visfuse_cli.vision import wireframe
 from visfuse_cli.vision.points import Courses
 from visfuse_cli.vision.wireframe import DIRECTIONS, Outlines
@@ -218,7 +218,7 @@ class Nursery:
         that it goes on from, whose number it has. None when it was hardly seen before."""
         camera, settings = self._camera, self._settings
         samples, pose = trace(camera, settings, self._dynamics, recent, taken_at, guess, velocity, beyond_doubt)
-        if settings.target.motion == "bicycle" and _ahead(pose) < -settings.life.confirm_m:
+        if settings.target.motion == "bicycle" and _ahead(samples, pose) < -REVERSES:
             guess = replace(guess, pose=guess.pose + [0, 0, np.pi])  # it was given the course of another
             velocity = (pose[-1, :2] - pose[0, :2]) / (samples[-1].t - samples[0].t)
             samples, pose = trace(camera, settings, self._dynamics, recent, taken_at, guess, velocity, beyond_doubt)
@@ -294,9 +294,12 @@ def _added(track: Track, tracks: list[Track], held: list[Track], next_id: int) -
     return max(next_id, track.id + 1)
 
 
-def _ahead(pose: Array) -> float:
-    """How far (m) a thing at poses (n, 3), one after another, gets the way it faces in the end."""
-    return float((pose[-1, :2] - pose[0, :2]) @ [np.cos(pose[-1, 2]), np.sin(pose[-1, 2])]) if len(pose) else 0.0
+def _ahead(samples: list[Sample], pose: Array) -> float:
+    """How fast (m/s), on average, a thing at poses (n, 3) goes the way it faces in the end."""
+    if len(pose) < 2:
+        return 0.0
+    way = (pose[-1, :2] - pose[0, :2]) @ [np.cos(pose[-1, 2]), np.sin(pose[-1, 2])]
+    return float(way) / (samples[-1].t - samples[0].t)
 
 
 def _seen(track: Track) -> float:

@@ -25,13 +25,12 @@ from visfuse_cli.tracking.hypotheses import LEAST_OPEN, Guess, gains
 from visfuse_cli.tracking.joining import WAIT_S, goes_on, lasting
 from visfuse_cli.tracking.lookback import Recent
 from visfuse_cli.tracking.settings import TrackerSettings
-from visfuse_cli.tracking.targets import Abandoned, Comparison, Sample, Track
+from visfuse_cli.tracking.targets import REVERSES, Abandoned, Comparison, Sample, Track
 from visfuse_cli.tracking.zones import Region
 from visfuse_cli.vision import wireframe
 
 VAGUE_M = 1.5  # m: a pose less certain than this is no measurement
 YOUNG, LEAP = 12, 4.0  # frames after which one measurement may not change the velocity by more (m/s)
-REVERSES = 6.0  # m/s: what goes backwards faster is something else, which came the other way
 SEEN_SHARE = 0.4  # of the unhidden area of a box that must have moved and of its border that must be found
 LIKENESS_S = 0.4  # s over which the share of the border that is found is averaged
 DOUBTFUL, MOVED_M = 0.25, 2.0  # share of the border that is not clear, to compare, and again so many m further

@@ -12,6 +12,8 @@ from visfuse_cli.tracking.settings import SizePrior
 from visfuse_cli.vision.contour import Look
 from visfuse_cli.vision.wireframe import Outlines
 
+REVERSES = 6.0  # m/s: what goes backwards faster is something else, which came the other way
+
 
 @dataclass(slots=True)
 class Sample:
