@@ -20,7 +20,7 @@ from typing import Any, Protocol, TypeVar
 import cv2
 from tqdm import tqdm
 
-from visfuse_cli.elsewhere import AHEAD, ahead
+from visfuse_cli.elsewhere import AHEAD, ENDED, ahead
 from visfuse_cli.files.folders import paths_of
 from visfuse_cli.files.run_json import write_run_json
 from visfuse_cli.files.runfolder import RunFolder
@@ -30,7 +30,6 @@ from visfuse_cli.records import Frame, FrameSet, RunRequest, TimeAudit
 from visfuse_cli.threads import thread_cap
 
 T = TypeVar("T")
-ENDED = object()
 GAP = 2.5  # intervals without a frame of the leading view that are bridged
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
@@ -133,9 +132,9 @@ class Run:
     def frames(self, source: VideoSource, total: int | None = None) -> Iterator[Frame]:
         """The frames of one clip, decoded ahead in a thread, until they end or the run is stopped."""
         with ahead(source.frames) as frames:
-            yield from self.told(frames, source.frame_count if total is None else total)
+            yield from self.until_stopped(frames, source.frame_count if total is None else total)
 
-    def told(self, items: Iterable[T], total: int | None) -> Iterator[T]:
+    def until_stopped(self, items: Iterable[T], total: int | None) -> Iterator[T]:
         """The same items, as many as `total` where that is known, with a progress bar, until the run is stopped."""
         with self._bar(total) as bar:
             for item in self._waited(iter(items)):
@@ -199,7 +198,7 @@ class Run:
                 item = next(items, ENDED)
             if item is ENDED:
                 return
-            yield item  # type: ignore[misc]
+            yield item
 
     def _bar(self, total: int | None) -> Any:
         return tqdm(total=total, unit=" frames", file=sys.stderr, disable=not self.progress, leave=False)

@@ -218,10 +218,10 @@ class Nursery:
         that it goes on from, whose number it has. None when it was hardly seen before."""
         camera, settings = self._camera, self._settings
         samples, pose = trace(camera, settings, self._dynamics, recent, taken_at, guess, velocity, beyond_doubt)
-        if settings.target.motion == "bicycle" and _ahead(samples, pose) < -REVERSES:
+        found, ahead = _driven(samples, pose)
+        if settings.target.motion == "bicycle" and ahead < -REVERSES:
             guess = replace(guess, pose=guess.pose + [0, 0, np.pi])  # it was given the course of another
-            velocity = (pose[-1, :2] - pose[0, :2]) / (samples[-1].t - samples[0].t)
-            samples, pose = trace(camera, settings, self._dynamics, recent, taken_at, guess, velocity, beyond_doubt)
+            samples, pose = trace(camera, settings, self._dynamics, recent, taken_at, guess, found, beyond_doubt)
         used = np.array([sample.measured for sample in samples], dtype=bool)
         if used.sum() < settings.life.confirm_frames or used.mean() < SEEN:
             return None
@@ -294,12 +294,12 @@ def _added(track: Track, tracks: list[Track], held: list[Track], next_id: int) -
     return max(next_id, track.id + 1)
 
 
-def _ahead(samples: list[Sample], pose: Array) -> float:
-    """How fast (m/s), on average, a thing at poses (n, 3) goes the way it faces in the end."""
+def _driven(samples: list[Sample], pose: Array) -> tuple[Array, float]:
+    """Mean velocity (2,) m/s of a thing at poses (n, 3), and how much of it goes the way it faces in the end."""
     if len(pose) < 2:
-        return 0.0
-    way = (pose[-1, :2] - pose[0, :2]) @ [np.cos(pose[-1, 2]), np.sin(pose[-1, 2])]
-    return float(way) / (samples[-1].t - samples[0].t)
+        return np.zeros(2), 0.0
+    velocity = (pose[-1, :2] - pose[0, :2]) / (samples[-1].t - samples[0].t)
+    return velocity, float(velocity @ [np.cos(pose[-1, 2]), np.sin(pose[-1, 2])])
 
 
 def _seen(track: Track) -> float:

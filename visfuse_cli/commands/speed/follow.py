@@ -76,7 +76,7 @@ def follow(clip: Clip, run_: Run, spool: TrackSpool, findings: Findings, first_i
         of = Recording(clip.name, label, clip.camera, findings.began[clip.name], motions.image_from_rest)
         settling = _Settling(of, tracker, lamps, run_, spool, findings.ledger)
         lookout = begin(look_out, clip.footage, clip.camera, empty, _comparing(clip), lag=FORESEEN)
-        for seen in run_.told(lookout, clip.source.frame_count):
+        for seen in run_.until_stopped(lookout, clip.source.frame_count):
             run_.count("frames")
             if seen is None:
                 lookout.answer(None)
