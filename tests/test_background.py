@@ -110,14 +110,38 @@ def test_a_thing_that_has_gone_leaves_no_ghost_and_a_thing_that_stands_stays(bac
     assert (labels[52:78, 22:58] == FOREGROUND).mean() > 0.9
 
 
+def test_a_part_of_a_large_thing_of_one_colour_is_no_ghost():
+    grey = cv2.cvtColor(road(), cv2.COLOR_BGR2GRAY)
+    lorry = cv2.rectangle(grey.copy(), (20, 20), (140, 100), 60, -1)
+    stood = cv2.rectangle(np.zeros_like(grey), (60, 40), (100, 80), 255, -1)  # its middle looks alike wherever it is
+    bright = cv2.rectangle(grey.copy(), (60, 40), (100, 80), 200, -1)
+    assert not find_ghosts(lorry, lorry, stood, cv2.compare(lorry, grey, cv2.CMP_NE), bright).any()
+    assert find_ghosts(lorry, lorry, stood, stood, bright)[60, 80] == 255  # by itself it would be one
+
+
+def test_the_picture_follows_what_changes_by_little_and_forgets_a_shadow_that_passed():
+    background = Background("mog2", 16.0, 0.45, 2.0)
+    background.start(road())
+    shaded = (road() * 0.6).astype(np.uint8)
+    lit = road() + np.uint8(4)
+    for k in range(600):
+        picture = shaded if k < 300 and k % 25 < 3 else lit
+        background.detect(picture)
+        background.learn(picture, k / 25, [])
+        if k == 299:
+            assert np.abs(background.picture - lit.astype(float)).mean() < 8  # a tenth of the time 45 levels darker
+    assert np.abs(background.picture - lit.astype(float)).max() <= 1
+
+
 def test_ghosts_need_contrast_in_the_background_alone():
     grey = cv2.cvtColor(road(), cv2.COLOR_BGR2GRAY)
     car = cv2.cvtColor(with_car(road(), 60), cv2.COLOR_BGR2GRAY)
     moved = cv2.compare(cv2.absdiff(grey, car), 10, cv2.CMP_GT)
-    assert find_ghosts(grey, grey, moved, car)[65, 80] == 255
-    assert not find_ghosts(car, car, moved, grey).any()
-    assert not find_ghosts(grey, car, moved, car).any()  # it has only just gone
-    assert not find_ghosts(grey, grey, np.zeros_like(grey), grey).any()
+    assert find_ghosts(grey, grey, moved, moved, car)[65, 80] == 255
+    assert not find_ghosts(car, car, moved, moved, grey).any()
+    assert not find_ghosts(grey, car, moved, moved, car).any()  # it has only just gone
+    nothing = np.zeros_like(grey)
+    assert not find_ghosts(grey, grey, nothing, nothing, grey).any()
 
 
 def test_the_kalman_background_learns_the_noise_and_the_slow_change_of_light():

@@ -7,6 +7,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from visfuse_cli.records import Array, Image
 from visfuse_cli.vision.ghosts import find_ghosts
@@ -17,7 +18,6 @@ NOISE = 3.0  # grey levels a channel, of what a picture and its background may d
 STILL_S = 1.0  # s that a ghost stands before it is looked for
 KNN_FIRST, KNN_LOOKING = (0.5,) * 10, 1e-9  # rates: it fills its samples one by one, and divides by the logarithm
 MIXTURES = 3  # of MOG2 in each pixel: a place seldom has more than two looks, and each takes time to read
-LEAST_RATE = 1 / 64  # of the picture each time: less would be lost in rounding
 LEARN_EVERY = 4  # frames: learning costs as much as looking
 
 
@@ -47,6 +47,7 @@ class Background:
         self._waiting = 0  # frames since the last one that was learnt
         self._learnt_t = 0.0
         self._picture: Image | None = None
+        self._mean: NDArray[np.float32]  # the same before it is rounded: what it changes by is less than a grey level
         self._labels: Image | None = None
         self._corrected: Image | None = None  # 255 where a ghost was taken out of the picture; the model learns slowly
         self._compared: tuple[float, Image, Image] | None = None  # t, grey picture and labels when ghosts were sought
@@ -56,6 +57,7 @@ class Background:
         for rate in self._first:
             self._model.apply(picture, learningRate=rate)
         self._picture, self._corrected, self._compared = picture.copy(), None, None
+        self._mean = picture.astype(np.float32)
 
     @property
     def picture(self) -> Image:
@@ -95,8 +97,8 @@ class Background:
             image = image.copy()
             cv2.copyTo(self._picture, mask, image)
         self._model.apply(image, learningRate=rate)
-        share = max(rate, LEAST_RATE)
-        self._picture = cv2.addWeighted(image, share, self._picture, 1 - share, 0)
+        cv2.accumulateWeighted(image, self._mean, rate)
+        self._picture = np.asarray(cv2.convertScaleAbs(self._mean), dtype=np.uint8)
 
     def _forget_ghosts(self, image: Image, t: float, now: Image | None) -> None:
         if self._compared is not None and t - self._compared[0] < STILL_S:
@@ -105,10 +107,11 @@ class Background:
         assert now is not None
         grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
         if self._compared is not None:
-            _, earlier, labels = self._compared
-            moved = cv2.compare(cv2.bitwise_and(now, labels), FOREGROUND, cv2.CMP_EQ)
-            gone = find_ghosts(grey, earlier, moved, cv2.cvtColor(self._picture, cv2.COLOR_BGR2GRAY))
+            _, earlier, then = self._compared
+            moved = cv2.compare(cv2.bitwise_and(now, then), FOREGROUND, cv2.CMP_EQ)
+            gone = find_ghosts(grey, earlier, moved, now, cv2.cvtColor(self._picture, cv2.COLOR_BGR2GRAY))
             if gone.any():
                 self._picture = np.asarray(cv2.copyTo(image, gone, self._picture.copy()), np.uint8)  # somebody may look
+                self._mean[gone > 0] = image[gone > 0]
                 self._corrected = gone if self._corrected is None else cv2.bitwise_or(self._corrected, gone)
         self._compared = t, grey, now
