@@ -16,6 +16,7 @@ from visfuse_cli.vision.exposure import Exposure, levelled
 CELLS, LEAST_POINTS = (16, 10), 12  # across and down: the best corner of each is looked for again
 EDGE = 8  # px from the picture's edge, at least
 WINDOW, LEVELS = (21, 21), 2
+SETTLED = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 10, 0.02)  # rounds at most, px: what stands still is quick
 ROUNDS = 6  # of weighing
 AGREE_PX = 1.0  # a corner that is further off does not belong to what stands still
 LEAST_AGREEING, LEAST_SHARE = 8, 0.15  # of the corners must agree; vehicles hide many, foliage moves
@@ -86,6 +87,7 @@ class Steady:
             start,
             winSize=WINDOW,
             maxLevel=LEVELS,
+            criteria=SETTLED,
             flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
         )
         seen = status.ravel() > 0
