@@ -36,7 +36,7 @@ class SpeedSettings(Section):
     min_frames: int = Field(6, ge=3, le=10000, description="measured frames")
     min_duration_s: float = Field(0.4, gt=0, le=600, description="s: shortest stretch a speed is measured over")
     min_distance_m: float = Field(2.0, gt=0, le=1000, description="m: shortest way a speed is measured over")
-    max_sigma: float = Field(0.15, gt=0, le=10, description="standard deviation over speed: above, too uncertain")
+    max_sigma: float = Field(0.06, gt=0, le=10, description="standard deviation over speed: above, too uncertain")
     max_acceleration: float = Field(9.0, gt=0, le=100, description="m/s^2: above, the track has jumped")
     min_evidence: float = Field(
         4.1,
