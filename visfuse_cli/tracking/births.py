@@ -275,13 +275,12 @@ class Nursery:
         """Run the filter over the frames seen before confirmation, poses (n, 3) in them being roughly known."""
         start = self._dynamics.begin(np.append(fit.pose[0, :2], pose[0, 2]), velocity)
         steps = [dynamics_tools.first(self._dynamics, start)]
+        z, R = self._dynamics.measured(*measure.measurements(fit, pose, HEADING_SIGMA))
         for k in range(1, len(samples)):
             dt = np.array([samples[k].t - samples[k - 1].t])
             expected = dynamics_tools.predict(self._dynamics, steps[-1:], dt, size[:1])[0]
             if samples[k].measured and fit.ok[k]:
-                predicted = np.append(fit.pose[k, :2], pose[k, 2])
-                z, R = self._dynamics.measured(*measure.measurement(fit, k, predicted, HEADING_SIGMA))
-                steps.append(dynamics_tools.take(self._dynamics, expected, z, R))
+                steps.append(dynamics_tools.take(self._dynamics, expected, z[k], R[k]))
             else:
                 steps.append(dynamics_tools.coast(expected))
         return steps

@@ -36,7 +36,7 @@ class Dynamics:
     begin: Callable[[Array, Array], Gaussian]  # pose (3,), velocity (2,) -> belief
     planar: Callable[[Array], tuple[Array, Array]]  # x (..., n) -> (X, Y, X', Y') and its Jacobian (..., 4, n)
     heading: Callable[[Array], Array]  # x (..., n) -> rad (...)
-    measured: Callable[[Array, Array], tuple[Array, Array]]  # pose (3,), cov (3, 3) -> z, R
+    measured: Callable[[Array, Array], tuple[Array, Array]]  # pose (..., 3), cov (..., 3, 3) -> z, R
     fades: bool  # fading factor in use
     log_p: Array | None = None
 
@@ -138,7 +138,7 @@ def _walk(filter_: FilterSettings, accelerates: bool, fades: bool) -> Dynamics:
         begin=begin,
         planar=lambda x: (x[..., :4], np.broadcast_to(np.eye(4, size), (*x.shape[:-1], 4, size))),
         heading=lambda x: np.arctan2(x[..., 3], x[..., 2]),
-        measured=lambda pose, cov: (pose[:2], cov[:2, :2]),
+        measured=lambda pose, cov: (pose[..., :2], cov[..., :2, :2]),
         fades=fades,
     )
 
@@ -178,7 +178,7 @@ def _interacting(filter_: FilterSettings, heading_seen: bool) -> Dynamics:
         begin=begin,
         planar=course.observe,
         heading=lambda x: x[..., 3],
-        measured=lambda pose, cov: (pose[: len(rows)], cov[: len(rows), : len(rows)]),
+        measured=lambda pose, cov: (pose[..., : len(rows)], cov[..., : len(rows), : len(rows)]),
         fades=False,
         log_p=imm.transition(len(COURSES), filter_.stay),
     )

@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 from functools import partial
 
 import numpy as np
+from numpy.typing import NDArray
 
 from visfuse_cli.maths.assignment import gate_size
 from visfuse_cli.maths.cameras import project
@@ -144,29 +145,38 @@ class GroundTracker:
         there = fit.ok & measure.looks_right(fit, look.outlines) & (look.moved > SEEN_SHARE) & ~(border < SEEN_SHARE)
         there &= look.open > LEAST_OPEN
         along, pace, ahead, doubt = self._paces(pose, size, evidence)
+        slips = np.array([self._slips(*each) for each in zip(self.tracks, ahead, doubt, strict=True)])
+        taken = self._taken(fit, pose, there & ~slips)
         for k, track in enumerate(self.tracks):
-            step = dynamics_tools.coast(self._expected[k])
+            step = taken.get(k, dynamics_tools.coast(self._expected[k]))
             if np.isfinite(border[k]):
                 share = min(1.0, (self._t - track.samples[-1].t) / LIKENESS_S)
                 track.likeness += (border[k] - track.likeness) * share
                 seen = look.border[k] * fit.agreed[k] * np.nan_to_num(look.clear[k], nan=1.0)
                 track.doubt += (1 - seen - track.doubt) * share
-            sample = Sample.of(frame, self._t, look, k, border, False)
-            slips = self._slips(track, ahead[k], doubt[k])
-            if there[k] and not slips:
-                z, R = self.dynamics.measured(*measure.measurement(fit, k, pose[k]))
-                tried = dynamics_tools.take(self.dynamics, self._expected[k], z, R)
-                if self._plausible(track, tried, z, R):
-                    step, sample.measured = tried, True
-                    track.last_measured, track.refused_since = sample.t, None
-                    self._learn_size(track, fit, k)
-                else:
-                    track.refused += 1
-                    track.refused_since = sample.t if track.refused_since is None else track.refused_since
-            if np.isfinite(pace[k]) and (slips or look.open[k] < HIDDEN):
+            if k in taken:
+                track.last_measured, track.refused_since = self._t, None
+            elif there[k] and not slips[k]:
+                track.refused += 1
+                track.refused_since = self._t if track.refused_since is None else track.refused_since
+            if np.isfinite(pace[k]) and (slips[k] or look.open[k] < HIDDEN):
                 step = dynamics_tools.take_speed(self.dynamics, step, along[k], pace[k], doubt[k])
-            track.samples.append(sample)
+            track.samples.append(Sample.of(frame, self._t, look, k, border, k in taken))
             track.steps.append(step)
+
+    def _taken(self, fit: wireframe.BoxFit, pose: Array, seen: NDArray[np.bool_]) -> dict[int, Step]:
+        """The steps of those of the tracks (N,) whose box was `seen` and is believed, by their place among the tracks.
+
+        Their sizes are learnt; `pose` (N, 3) is where they were expected.
+        """
+        which = np.flatnonzero(seen)
+        if not len(which):
+            return {}
+        z, R = self.dynamics.measured(*measure.measurements(fit[which], pose[which]))
+        steps = dynamics_tools.take_each(self.dynamics, [self._expected[k] for k in which], z, R)
+        plausible = self._plausible([self.tracks[k] for k in which], steps, z, R)
+        self._learn_sizes([self.tracks[k] for k in which[plausible]], fit[which[plausible]])
+        return {int(k): step for k, step, good in zip(which, steps, plausible, strict=True) if good}
 
     def _slips(self, track: Track, ahead: float, doubt: float) -> bool:
         """Whether a box is left behind by the corners on it, which are `ahead` (m/s, deviation `doubt`) of it."""
@@ -280,27 +290,35 @@ class GroundTracker:
         reach = 3 * np.sqrt(np.nan_to_num(spread) + (upright * sigma / height) ** 2)
         return np.clip(reach, REACH_PX[0], np.maximum(REACH_PX[1], REACH_SHARE * upright))
 
-    def _plausible(self, track: Track, step: Step, z: Array, R: Array) -> bool:
-        """Enough outline to place the box, inside the gate, no leap of speed and no driving backwards at speed."""
-        if R[0, 0] + R[1, 1] > VAGUE_M**2:
-            return False
+    def _plausible(self, tracks: list[Track], steps: list[Step], z: Array, R: Array) -> NDArray[np.bool_]:
+        """Which (n,) of some steps have enough outline to place the box, lie inside the gate, and are no leap of speed
+        and no driving backwards at speed."""
         H = self.dynamics.H
-        gamma = dynamics_tools.residual(self.dynamics, z, step.prior.mean)
-        if mahalanobis(gamma, H @ step.prior.cov @ H.T + R) > self._gate:
-            return False
-        before, after = self.dynamics.planar(np.stack([step.prior.mean, step.posterior.mean]))[0][:, 2:]
-        heading = float(self.dynamics.heading(step.posterior.mean))
-        if after @ [np.cos(heading), np.sin(heading)] < -REVERSES:
-            return False
-        return len(track.samples) < YOUNG or float(np.hypot(*(after - before))) < LEAP
+        prior = dynamics_tools.stacked([step.prior for step in steps])
+        after = dynamics_tools.stacked([step.posterior for step in steps])
+        gamma = dynamics_tools.residual(self.dynamics, z, prior.mean)
+        near = mahalanobis(gamma, H @ prior.cov @ H.T + R) <= self._gate
+        velocity = self.dynamics.planar(after.mean)[0][:, 2:]
+        gained = velocity - self.dynamics.planar(prior.mean)[0][:, 2:]
+        heading = self.dynamics.heading(after.mean)
+        ahead = np.sum(velocity * np.column_stack([np.cos(heading), np.sin(heading)]), axis=1)
+        young = np.array([len(track.samples) < YOUNG for track in tracks])
+        placed = R[:, 0, 0] + R[:, 1, 1] <= VAGUE_M**2
+        return placed & near & (ahead >= -REVERSES) & (young | (np.hypot(*gained.T) < LEAP))
 
-    def _learn_size(self, track: Track, fit: wireframe.BoxFit, k: int) -> None:
+    def _learn_sizes(self, tracks: list[Track], fit: wireframe.BoxFit) -> None:
+        """Take in what the boxes of n tracks say about their sizes."""
+        if not tracks:
+            return
+        size, sigma = (np.array([getattr(track, name) for track in tracks]) for name in ("size", "size_sigma"))
+        told, pull = measure.told_of_size(fit, size, sigma)
         # Frames of one target share their errors (the same light, the same shadow): each counts as a tenth.
-        told, pull = measure.told_of_size(fit[k : k + 1], track.size, track.size_sigma)
-        cov = np.linalg.inv(np.diag(track.size_sigma**-2.0) + told[0] / 10)
-        step = cov @ pull[0] / 10
-        track.size = np.maximum(track.size + np.clip(step, -track.size_sigma, track.size_sigma), 0.2)
-        track.size_sigma = np.maximum(np.sqrt(np.diagonal(cov)), 0.03)
+        cov = np.linalg.inv(np.eye(3) * sigma[..., None] ** -2.0 + told / 10)
+        step = (cov @ pull[..., None])[..., 0] / 10
+        size = np.maximum(size + np.clip(step, -sigma, sigma), 0.2)
+        sigma = np.maximum(np.sqrt(np.diagonal(cov, axis1=1, axis2=2)), 0.03)
+        for k, track in enumerate(tracks):
+            track.size, track.size_sigma = size[k], sigma[k]
 
     def _end(self) -> list[Track]:
         """Take out and return the tracks that have come to an end."""

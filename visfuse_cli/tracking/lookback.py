@@ -90,10 +90,11 @@ class _Way:
         there = fit.ok & measure.looks_right(fit, look.outlines) & hypotheses.seen(look, self._beyond_doubt)
         there &= look.open > hypotheses.LEAST_OPEN
         border = look.border * fit.agreed
+        z, R = self._dynamics.measured(*measure.measurements(fit, pose))
         for k, (frame, t, _) in enumerate(frames):
             if self._last_seen - t > LOST_S:
                 return False
-            seen = self._take(t, measure.measurement(fit, k, pose[k]) if there[k] else None)
+            seen = self._take(t, (z[k], R[k]) if there[k] else None)
             self._samples.append(Sample.of(frame, t, look, k, border, seen))
             mean = self._step.posterior.mean
             self._poses.append(np.array([mean[0], mean[1], self._dynamics.heading(mean) - np.pi]))
@@ -126,7 +127,7 @@ class _Way:
         self._before, self._step = t, dynamics_tools.coast(expected)
         if measured is None:
             return False
-        z, R = dynamics.measured(*measured)
+        z, R = measured
         z[2:] += np.pi  # the heading, where it is measured
         gamma = dynamics_tools.residual(dynamics, z, expected.prior.mean)
         if mahalanobis(gamma, dynamics.H @ expected.prior.cov @ dynamics.H.T + R) >= self._gate:

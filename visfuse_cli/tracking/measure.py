@@ -53,14 +53,15 @@ def noise_of(outlines: Outlines, settings: PoseSettings) -> Array:
     return np.asarray(settings.sigma_px + settings.sigma_share * outlines.width)
 
 
-def measurement(fit: BoxFit, index: int, predicted: Array, heading_sigma: float = HEADING_SIGMA) -> tuple[Array, Array]:
-    """Pose (3,) and covariance (3, 3) that the outline alone supports: the heading's prior is divided out."""
-    pose, cov = fit.pose[index].copy(), fit.cov[index, :3, :3].copy()
-    information = max(1 / cov[2, 2] - 1 / heading_sigma**2, 1e-2)
-    shift = (pose[2] - predicted[2]) / (cov[2, 2] * information)
-    pose[2] = predicted[2] + np.clip(shift, -0.6, 0.6)
-    cov[2, :2] = cov[:2, 2] = 0
-    cov[2, 2] = 1 / information
+def measurements(fit: BoxFit, predicted: Array, heading_sigma: float = HEADING_SIGMA) -> tuple[Array, Array]:
+    """Poses (N, 3) and covariances (N, 3, 3) that N outlines alone support: the prior of the headings, which was that
+    of the `predicted` poses (N, 3), is divided out."""
+    pose, cov = fit.pose.copy(), fit.cov[:, :3, :3].copy()
+    information = np.maximum(1 / cov[:, 2, 2] - 1 / heading_sigma**2, 1e-2)
+    shift = (pose[:, 2] - predicted[:, 2]) / (cov[:, 2, 2] * information)
+    pose[:, 2] = predicted[:, 2] + np.clip(shift, -0.6, 0.6)
+    cov[:, 2, :2] = cov[:, :2, 2] = 0
+    cov[:, 2, 2] = 1 / information
     return pose, cov
 
 
@@ -149,8 +150,9 @@ def pooled_size(fit: BoxFit, mean: Array, sigma: Array) -> tuple[Array, Array]:
 
 
 def told_of_size(fit: BoxFit, size: Array, sigma: Array) -> tuple[Array, Array]:
-    """What N outlines alone say about a size (3,) of deviation `sigma` (3,): information (N, 3, 3), and that times how
-    far off it is (N, 3). Length and height of what is seen from behind are told together."""
+    """What N outlines alone say about a size of deviation `sigma`, one (3,) or each its own (N, 3): information
+    (N, 3, 3), and that times how far off it is (N, 3). Length and height of what is seen from behind are told together.
+    """
     posterior = np.linalg.inv(fit.cov[:, 3:, 3:])
     pull = (posterior @ (fit.size - size)[..., None])[..., 0]
-    return np.asarray(posterior - np.diag(sigma**-2.0), dtype=float), np.asarray(pull, dtype=float)
+    return np.asarray(posterior - np.eye(3) * sigma[..., None] ** -2.0, dtype=float), np.asarray(pull, dtype=float)

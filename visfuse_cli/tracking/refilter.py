@@ -50,10 +50,8 @@ def settled_poses(
     samples: list[Sample], steps: list[Step], fit: measure.BoxFit, pose: Array, size: Array, dynamics: Dynamics
 ) -> Poses:
     """What the boxes of a size (3,) say that were fitted around the poses (T, 3) of a track."""
-    measured = [
-        dynamics.measured(*measure.measurement(fit, k, pose[k])) if samples[k].measured and fit.ok[k] else None
-        for k in range(len(samples))
-    ]
+    z, R = dynamics.measured(*measure.measurements(fit, pose))
+    measured = [(z[k], R[k]) if sample.measured and fit.ok[k] else None for k, sample in enumerate(samples)]
     t = np.array([sample.t for sample in samples])
     start = _start(t, measured, pose, dynamics) or steps[0].posterior
     # It begins knowing nearly nothing.
