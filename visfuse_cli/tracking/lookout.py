@@ -85,8 +85,7 @@ def look_out(
 
     `empty` (H, W, 3) is the scene without its traffic. Returns what the times and the camera were like.
     """
-    # One core belongs to the tracker: a pool as large as the machine would wait for it, spinning.
-    cv2.setNumThreads(thread_cap() or max(1, cv2.getNumberOfCPUs() - 1))
+    cv2.setNumThreads(thread_cap() or cv2.getNumberOfCPUs())
     watch = CameraWatch(empty)
     comparison = None if how is None else Comparison(camera, how, empty)
     with opened() as source:

@@ -69,11 +69,12 @@ class Background:
         """Label each pixel of `image` (H, W, 3): 255 foreground, 127 shadow, 0 background, without learning it."""
         self._labels = np.asarray(self._model.apply(image, learningRate=self._looking), dtype=np.uint8)
         if self._corrected is not None and self._picture is not None:
-            u, v, w, h = cv2.boundingRect(self._corrected)
-            part = np.s_[v : v + h, u : u + w]
-            far = cv2.absdiff(image[part], self._picture[part]).astype(np.float32)
-            alike = np.einsum("uvc,uvc->uv", far, far) < self._farthest
-            self._labels[part][alike & (self._corrected[part] > 0)] = 0
+            found = cv2.findNonZero(cv2.bitwise_and(self._labels, self._corrected))
+            if found is not None:
+                u, v = found.reshape(-1, 2).T
+                far = image[v, u].astype(np.int32) - self._picture[v, u]
+                alike = np.sum(far**2, axis=1) < self._farthest
+                self._labels[v[alike], u[alike]] = 0
         return self._labels
 
     def learn(self, image: Image, t: float, followed: Iterable[Array], labels: Image | None = None) -> None:

@@ -63,7 +63,6 @@ class Clip:
 
 def follow(clip: Clip, run_: Run, spool: TrackSpool, findings: Findings, first_id: int, label: str | None) -> int:
     """Follow everything in one clip; returns the next free id."""
-    cv2.setNumThreads(1)  # the other cores belong to the lookout
     findings.ledger.drawn[clip.name] = []
     strangers = findings.strangers[clip.name] = Strangers(clip.camera)
     motions = findings.motions[clip.name] = Motions()
@@ -71,6 +70,7 @@ def follow(clip: Clip, run_: Run, spool: TrackSpool, findings: Findings, first_i
         with run_.stage("warm up"):
             empty = _empty_scene(clip.source, clip.config.background.warmup_s)
             give_back()
+            cv2.setNumThreads(1)  # the other cores belong to the lookout
             detector, lamps = _detector(clip), Headlights(empty, clip.camera)
         tracker = GroundTracker(clip.camera, clip.config, first_id)
         of = Recording(clip.name, label, clip.camera, findings.began[clip.name], motions.image_from_rest)
