@@ -108,8 +108,7 @@ def test_an_end_before_the_first_frame_has_the_same_code(number, code, H, tmp_pa
     with open(fifo, "w"):  # returns as soon as the run opens it
         time.sleep(0.1)
         running.send_signal(number)
-        time.sleep(0.2)
-    _, errors = running.communicate(timeout=60)
+        _, errors = running.communicate(timeout=60)  # it waits on: only the signal ends it
     assert running.returncode == code, errors
     assert len(errors.splitlines()) <= 1
     assert b"Traceback" not in errors
