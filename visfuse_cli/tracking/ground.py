@@ -148,7 +148,7 @@ class GroundTracker:
         slips = np.array([self._slips(*each) for each in zip(self.tracks, ahead, doubt, strict=True)])
         taken = self._taken(fit, pose, there & ~slips)
         for k, track in enumerate(self.tracks):
-            step = taken.get(k, dynamics_tools.coast(self._expected[k]))
+            step = taken[k] if k in taken else dynamics_tools.coast(self._expected[k])
             if np.isfinite(border[k]):
                 share = min(1.0, (self._t - track.samples[-1].t) / LIKENESS_S)
                 track.likeness += (border[k] - track.likeness) * share
