@@ -28,6 +28,8 @@ UNSEEN_S = 1.5  # s: a stretch goes over no longer gap
 JUMP_S = 0.3  # s a change of speed is looked at
 SUDDEN = 2.0  # times as much as it is counts what a vehicle gains: it cannot as fast as it brakes
 WANDER_PX, WANDER_S = 0.6, 2.0  # px by which outlines lie off, and s for which they do: noise that frames share
+USUAL_MISFIT_PX, AMIDST = 1.8, 10.0  # rms of an outline's misfit; what a share of it amidst others adds to its logarithm
+LEAST_DOUBT, MOST_DOUBT = 0.4, 2.5  # times as far as usual that outlines lie off
 
 
 class SpeedSettings(Section):
@@ -36,7 +38,7 @@ class SpeedSettings(Section):
     min_frames: int = Field(6, ge=3, le=10000, description="measured frames")
     min_duration_s: float = Field(0.4, gt=0, le=600, description="s: shortest stretch a speed is measured over")
     min_distance_m: float = Field(2.0, gt=0, le=1000, description="m: shortest way a speed is measured over")
-    max_sigma: float = Field(0.06, gt=0, le=10, description="standard deviation over speed: above, too uncertain")
+    max_sigma: float = Field(0.08, gt=0, le=10, description="standard deviation over speed: above, too uncertain")
     max_acceleration: float = Field(9.0, gt=0, le=100, description="m/s^2: above, the track has jumped")
     min_evidence: float = Field(
         4.1,
@@ -63,7 +65,7 @@ class SpeedSettings(Section):
 class Verdict:
     """A stretch [first, last] of a path: mean speed and deviation (m/s), way (m), course (rad), reason or ''.
 
-    `noise` (m/s) is the deviation without what the calibration adds.
+    `noise` (m/s) is the deviation without what the calibration adds, if the box fitted as well as usual.
     """
 
     first: int
@@ -133,12 +135,18 @@ def _best_stretch(
     turned = (TURN_M * (angle[j] - angle[i])) ** 2
     stamps = 2 * (distance / np.maximum(duration, 1e-9) * settings.sigma_t_s) ** 2
     own = pose + bias + wander + size + turned + stamps
-    sigma_way = np.sqrt(own + np.clip(calibration, 0, None))
+    sigma_way = np.sqrt(own * _doubt_of_outline(path) ** 2 + np.clip(calibration, 0, None))
     doubt = sigma_way / np.maximum(distance, 1e-3)
     good = doubt <= max(LONGER_FOR * float(doubt.min()), GOOD_ENOUGH)
     best = int(np.argmax(np.where(good, distance, -np.inf)))
     took = max(duration[best], 1e-9)
     return int(i[best]), int(j[best]), float(sigma_way[best] / took), float(np.sqrt(own[best]) / took)
+
+
+def _doubt_of_outline(path: Path) -> float:
+    """How many times as far as usual the outlines of a track lie off: as badly as its box fits, more amidst others."""
+    times = path.misfit_px / USUAL_MISFIT_PX * np.exp(AMIDST * (1 - path.apart))
+    return float(np.clip(times, LEAST_DOUBT, MOST_DOUBT)) if np.isfinite(times) else 1.0
 
 
 def _tangents(velocity: Array) -> Array:
