@@ -12,7 +12,17 @@ from visfuse_cli.maths.polygons import area, contains, distance, surrounding
 from visfuse_cli.tracking.conclude import conclude
 from visfuse_cli.tracking.ground import GroundTracker
 from visfuse_cli.tracking.settings import TrackerSettings
-from visfuse_cli.tracking.verdict import LIKE_A_PART, ODD, SpeedSettings, evidence, judge
+from visfuse_cli.tracking.verdict import (
+    CLEARANCE,
+    LEAST_DOUBT,
+    LIKE_A_PART,
+    MOST_DOUBT,
+    ODD,
+    USUAL_MISFIT_PX,
+    SpeedSettings,
+    evidence,
+    judge,
+)
 from visfuse_cli.tracking.zones import Region, stretch, trusted
 
 CAMERA = road_camera()
@@ -144,8 +154,32 @@ def test_noise_speaks_against_a_track_and_a_vague_calibration_does_not(passing):
     between = (well + badly) / 2
     assert judged(path, least=between).reason == ""
     assert judged(noisy, least=between).reason.startswith("too little seen")
-    wild = replace(path, pose_cov=path.pose_cov + np.diag([16.0, 16.0, 0.0, 0.0]))
+    wild = replace(path, pose_cov=path.pose_cov + np.diag([36.0, 36.0, 0.0, 0.0]))
     assert judged(wild).reason.startswith("too uncertain")
+
+
+def test_the_interval_knows_how_well_the_box_fits_and_what_speaks_for_a_track_does_not(passing):
+    _, settings, tracker, (track,) = passing
+    (path,) = conclude([track], CAMERA, settings, tracker.dynamics)
+
+    def judged(**changed):
+        seen = replace(path, **changed)
+        verdict = judge(seen, 0 * CAMERA.ground.cov, 1.0, SpeedSettings(), np.ones(len(path.t), dtype=bool))
+        return verdict, evidence(seen, verdict)
+
+    def own(**changed):
+        verdict = judged(**changed)[0]
+        return np.sqrt(verdict.sigma**2 - (CLEARANCE * verdict.speed) ** 2)
+
+    usual, well = judged(misfit_px=USUAL_MISFIT_PX, apart=1.0)
+    off, badly = judged(misfit_px=2 * USUAL_MISFIT_PX, apart=1.0)
+    assert own(misfit_px=USUAL_MISFIT_PX, apart=1.0) == pytest.approx(usual.noise)
+    assert own(misfit_px=2 * USUAL_MISFIT_PX, apart=1.0) == pytest.approx(2 * usual.noise)
+    assert (off.noise, badly) == (usual.noise, well)
+    assert own(misfit_px=USUAL_MISFIT_PX, apart=0.95) > 1.3 * usual.noise
+    assert own(misfit_px=0.01, apart=1.0) == pytest.approx(LEAST_DOUBT * usual.noise)
+    assert own(misfit_px=99.0, apart=0.5) == pytest.approx(MOST_DOUBT * usual.noise)
+    assert own(misfit_px=np.nan) == pytest.approx(usual.noise)  # no box was fitted again
 
 
 def test_what_is_slim_must_be_seen_better_and_of_all_else_an_odd_size(passing):

@@ -28,8 +28,9 @@ UNSEEN_S = 1.5  # s: a stretch goes over no longer gap
 JUMP_S = 0.3  # s a change of speed is looked at
 SUDDEN = 2.0  # times as much as it is counts what a vehicle gains: it cannot as fast as it brakes
 WANDER_PX, WANDER_S = 0.6, 2.0  # px by which outlines lie off, and s for which they do: noise that frames share
-USUAL_MISFIT_PX, AMIDST = 1.8, 10.0  # rms of an outline's misfit; what a share of it amidst others adds to its logarithm
+USUAL_MISFIT_PX, AMIDST = 1.8, 10.0  # rms misfit of an outline; what a share of it amidst others adds to its logarithm
 LEAST_DOUBT, MOST_DOUBT = 0.4, 2.5  # times as far as usual that outlines lie off
+CLEARANCE = 0.003  # of a way: where tyres and the dark beneath hide the ground, it is measured a little above it
 
 
 class SpeedSettings(Section):
@@ -41,7 +42,7 @@ class SpeedSettings(Section):
     max_sigma: float = Field(0.08, gt=0, le=10, description="standard deviation over speed: above, too uncertain")
     max_acceleration: float = Field(9.0, gt=0, le=100, description="m/s^2: above, the track has jumped")
     min_evidence: float = Field(
-        4.1,
+        4.0,
         ge=0,
         le=10,
         description="share of its outline that was found, plus 3 times the share that does not lie in the midst of "
@@ -65,7 +66,7 @@ class SpeedSettings(Section):
 class Verdict:
     """A stretch [first, last] of a path: mean speed and deviation (m/s), way (m), course (rad), reason or ''.
 
-    `noise` (m/s) is the deviation without what the calibration adds, if the box fitted as well as usual.
+    `noise` (m/s) is the deviation without what all vehicles share, if the box fitted as well as usual.
     """
 
     first: int
@@ -101,7 +102,7 @@ def judge(path: Path, entry_cov: Array, bias_px: float, settings: SpeedSettings,
 def _best_stretch(
     path: Path, length: Array, tangent: Array, entry_cov: Array, bias_px: float, settings: SpeedSettings
 ) -> tuple[int, int, float, float]:
-    """First and last state, and the deviations of the mean speed between them (m/s), with and without calibration."""
+    """First and last state, and the deviations of the mean speed between them (m/s): whole, and as `Verdict.noise`."""
     seen = np.flatnonzero(path.measured) if path.measured.any() else np.arange(len(path.t))
     grid = np.unique(seen[np.linspace(0, len(seen) - 1, min(len(seen), 48)).astype(int)])
     i, j = (index.ravel() for index in np.meshgrid(grid, grid, indexing="ij"))
@@ -135,7 +136,8 @@ def _best_stretch(
     turned = (TURN_M * (angle[j] - angle[i])) ** 2
     stamps = 2 * (distance / np.maximum(duration, 1e-9) * settings.sigma_t_s) ** 2
     own = pose + bias + wander + size + turned + stamps
-    sigma_way = np.sqrt(own * _doubt_of_outline(path) ** 2 + np.clip(calibration, 0, None))
+    shared = np.clip(calibration, 0, None) + (CLEARANCE * distance) ** 2
+    sigma_way = np.sqrt(own * _doubt_of_outline(path) ** 2 + shared)
     doubt = sigma_way / np.maximum(distance, 1e-3)
     good = doubt <= max(LONGER_FOR * float(doubt.min()), GOOD_ENOUGH)
     best = int(np.argmax(np.where(good, distance, -np.inf)))
