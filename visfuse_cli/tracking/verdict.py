@@ -84,7 +84,7 @@ def judge(path: Path, entry_cov: Array, bias_px: float, settings: SpeedSettings,
 
     The stretch's ends may lie anywhere on the measured path; pose noise counts less with length, calibration doubt
     grows away from the surveyed points; `trusted` (T,) tells where the calibration holds. Well known is a doubt of
-    GOOD_ENOUGH, or LONGER_FOR times the least.
+    GOOD_ENOUGH, or LONGER_FOR times the least, of a box that fits as well as usual.
     """
     position, velocity = path.planar.mean[:, :2], path.planar.mean[:, 2:]
     tangent = _tangents(velocity)
@@ -136,13 +136,14 @@ def _best_stretch(
     turned = (TURN_M * (angle[j] - angle[i])) ** 2
     stamps = 2 * (distance / np.maximum(duration, 1e-9) * settings.sigma_t_s) ** 2
     own = pose + bias + wander + size + turned + stamps
-    shared = np.clip(calibration, 0, None) + (CLEARANCE * distance) ** 2
-    sigma_way = np.sqrt(own * _doubt_of_outline(path) ** 2 + shared)
-    doubt = sigma_way / np.maximum(distance, 1e-3)
+    calibration = np.clip(calibration, 0, None)
+    doubt = np.sqrt(own + calibration) / np.maximum(distance, 1e-3)
     good = doubt <= max(LONGER_FOR * float(doubt.min()), GOOD_ENOUGH)
     best = int(np.argmax(np.where(good, distance, -np.inf)))
-    took = max(duration[best], 1e-9)
-    return int(i[best]), int(j[best]), float(sigma_way[best] / took), float(np.sqrt(own[best]) / took)
+    took, noise = max(duration[best], 1e-9), float(np.sqrt(own[best]))
+    shared = calibration[best] + (CLEARANCE * distance[best]) ** 2
+    sigma = float(np.sqrt((_doubt_of_outline(path) * noise) ** 2 + shared))
+    return int(i[best]), int(j[best]), sigma / took, noise / took
 
 
 def _doubt_of_outline(path: Path) -> float:
