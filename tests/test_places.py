@@ -154,7 +154,7 @@ def test_noise_speaks_against_a_track_and_a_vague_calibration_does_not(passing):
     between = (well + badly) / 2
     assert judged(path, least=between).reason == ""
     assert judged(noisy, least=between).reason.startswith("too little seen")
-    wild = replace(path, pose_cov=path.pose_cov + np.diag([36.0, 36.0, 0.0, 0.0]))
+    wild = replace(path, pose_cov=path.pose_cov + np.diag([16.0, 16.0, 0.0, 0.0]), misfit_px=USUAL_MISFIT_PX)
     assert judged(wild).reason.startswith("too uncertain")
 
 
