@@ -118,7 +118,7 @@ class Comparison:
         """Compare a frame."""
         raw = self._background.detect(frame.image)
         grey = _grey(frame.image)
-        light = lightness(grey, _grey(self._background.picture))
+        light = lightness(grey, self._background.grey)
         hard = raw if self._darkness.known else without_soft_shadows(raw, light)
         labels = self._darkness.told(hard, light)
         if self._watched is not None:

@@ -7,7 +7,6 @@ from numpy.typing import NDArray
 
 from visfuse_cli.maths.cameras import project
 from visfuse_cli.maths.medians import median
-from visfuse_cli.maths.polygons import distance
 from visfuse_cli.records import Array, GroundCamera
 from visfuse_cli.vision import wireframe
 from visfuse_cli.vision.points import Moves, window_px
@@ -56,13 +55,15 @@ def paces(camera: GroundCamera, pose: Array, size: Array, expected: Array, moves
 
 def _well_inside(camera: GroundCamera, pose: Array, size: Array, pixels: Array, owner: Array) -> NDArray[np.bool_]:
     """Which of the corners at pixels (n, 2) lie so far inside of the outline of their box that it alone moves them."""
-    inside = np.zeros(len(pixels), dtype=bool)
-    for k in np.unique(owner[owner >= 0]):
-        hull = wireframe.silhouette(camera, pose[k], size[k])
-        if len(hull):
-            margin = min(window_px(camera), MARGIN * float(np.ptp(hull[:, 0])))
-            inside[owner == k] = distance(hull, pixels[owner == k]) > margin
-    return inside
+    box = wireframe.projected(camera, pose, size)
+    outline = wireframe.silhouette_edges(camera, pose, size)
+    first, last = box[..., wireframe.EDGES[:, 0]], box[..., wireframe.EDGES[:, 1]]  # (2, N, 12)
+    along, offset = (last - first)[:, owner], pixels.T[..., None] - first[:, owner]  # (2, n, 12)
+    share = np.sum(offset * along, axis=0) / np.maximum(np.sum(along**2, axis=0), 1e-12)
+    off = np.hypot(*(offset - np.minimum(np.maximum(share, 0), 1) * along))
+    border = np.where(outline[owner], off, np.inf).min(axis=1)
+    margin = np.minimum(window_px(camera), MARGIN * np.ptp(box[0], axis=1))
+    return np.asarray((owner >= 0) & (border > margin[owner]))
 
 
 def _inverse(J: Array) -> Array:

@@ -47,7 +47,8 @@ class Background:
         self._waiting = 0  # frames since the last one that was learnt
         self._learnt_t = 0.0
         self._picture: Image | None = None
-        self._mean: NDArray[np.float32]  # the same before it is rounded: what it changes by is less than a grey level
+        self._grey: Image | None = None
+        self._mean: NDArray[np.float32]  # the picture before it is rounded: what it changes by is less than a grey level
         self._labels: Image | None = None
         self._corrected: Image | None = None  # 255 where a ghost was taken out of the picture; the model learns slowly
         self._compared: tuple[float, Image, Image] | None = None  # t, grey picture and labels when ghosts were sought
@@ -56,7 +57,8 @@ class Background:
         """Begin from a picture (H, W, 3) of the empty scene."""
         for rate in self._first:
             self._model.apply(picture, learningRate=rate)
-        self._picture, self._corrected, self._compared = picture.copy(), None, None
+        self._picture, self._grey = picture.copy(), None
+        self._corrected = self._compared = None
         self._mean = picture.astype(np.float32)
 
     @property
@@ -64,6 +66,13 @@ class Background:
         """The scene without what moves (H, W, 3), as far as it is known."""
         assert self._picture is not None
         return self._picture
+
+    @property
+    def grey(self) -> Image:
+        """The picture in grey (H, W)."""
+        if self._grey is None:
+            self._grey = np.asarray(cv2.cvtColor(self.picture, cv2.COLOR_BGR2GRAY), dtype=np.uint8)
+        return self._grey
 
     def detect(self, image: Image) -> Image:
         """Label each pixel of `image` (H, W, 3): 255 foreground, 127 shadow, 0 background, without learning it."""
@@ -99,7 +108,7 @@ class Background:
             cv2.copyTo(self._picture, mask, image)
         self._model.apply(image, learningRate=rate)
         cv2.accumulateWeighted(image, self._mean, rate)
-        self._picture = np.asarray(cv2.convertScaleAbs(self._mean), dtype=np.uint8)
+        self._picture, self._grey = np.asarray(cv2.convertScaleAbs(self._mean), dtype=np.uint8), None
 
     def _forget_ghosts(self, image: Image, t: float, now: Image | None) -> None:
         if self._compared is not None and t - self._compared[0] < STILL_S:
@@ -110,7 +119,7 @@ class Background:
         if self._compared is not None:
             _, earlier, then = self._compared
             moved = cv2.compare(cv2.bitwise_and(now, then), FOREGROUND, cv2.CMP_EQ)
-            gone = find_ghosts(grey, earlier, moved, now, cv2.cvtColor(self._picture, cv2.COLOR_BGR2GRAY))
+            gone = find_ghosts(grey, earlier, moved, now, self.grey)
             if gone.any():
                 self._picture = np.asarray(cv2.copyTo(image, gone, self._picture.copy()), np.uint8)  # somebody may look
                 self._mean[gone > 0] = image[gone > 0]
