@@ -26,7 +26,8 @@ def tangent_rows(support, valid):
     n = len(support)
     nowhere = np.zeros((n, DIRECTIONS, 2), dtype=int)
     width = 2 * support.mean(axis=1)
-    return Outlines(np.tile(FAN, (n, 1, 1)), support, nowhere, 0.0 * support, valid, np.ones(n, dtype=bool), width)
+    none, every = 0.0 * support, np.ones(n, dtype=bool)
+    return Outlines(np.tile(FAN, (n, 1, 1)), support, nowhere, none, valid, every, width, np.nan * support)
 
 
 def fit(camera, outlines, start, size, size_sigma, sigma_px=1.5):

@@ -13,7 +13,7 @@ from visfuse_cli.maths.cameras import project
 from visfuse_cli.maths.gaussian import symmetrise
 from visfuse_cli.records import Array, Gaussian, GroundCamera
 from visfuse_cli.tracking import dynamics as dynamics_tools
-from visfuse_cli.tracking import measure
+from visfuse_cli.tracking import measure, sills
 from visfuse_cli.tracking.dynamics import Dynamics, Step
 from visfuse_cli.tracking.refilter import filter_again, nis_of, settled_poses
 from visfuse_cli.tracking.settings import TrackerSettings
@@ -52,6 +52,7 @@ class Path:
     support: float  # the same, of all of it: what is hidden, out of the picture or amidst others counts
     apart: float  # mean share of the outline that does not lie in the midst of paint
     paint: float  # mean share of the area that was paint, neither shadow nor as the empty road is
+    shaded: float  # mean share of the outline on the ground that stands in shadow
     misfit_px: float
     ended_by: str
     ahead: Array  # (T, 2) m: where it was expected a latency later, from what was known then
@@ -73,14 +74,21 @@ class _Settled:
 
 
 def conclude(
-    tracks: Sequence[Track], camera: GroundCamera, settings: TrackerSettings, dynamics: Dynamics
+    tracks: Sequence[Track],
+    camera: GroundCamera,
+    settings: TrackerSettings,
+    dynamics: Dynamics,
+    fall: Array | None = None,
 ) -> list[Path]:
     """Settle each track's size, fit every frame again with it, and smooth; with `smooth` off, keep the causal states.
 
-    A few tracks together take little longer than one.
+    Shadows fall `fall` (2,) m for a metre of height, where that is known. A few tracks together take little longer than
+    one.
     """
-    settle = _settled if settings.smooth else _as_they_were
-    found = settle(tracks, camera, settings, dynamics)
+    if settings.smooth:
+        found = _settled(tracks, camera, settings, dynamics, fall)
+    else:
+        found = _as_they_were(tracks)
     return [_path(track, of, camera, settings, dynamics) for track, of in zip(tracks, found, strict=True)]
 
 
@@ -113,15 +121,14 @@ def _path(track: Track, of: _Settled, camera: GroundCamera, settings: TrackerSet
         support=float(np.mean([s.outline.tangent or s.outline.valid.mean() for s in samples if s.measured])),
         apart=_mean([s.apart for s in samples if s.measured]),
         paint=_mean([s.paint for s in samples if s.measured]),
+        shaded=_mean([s.shaded for s in samples if s.measured]),
         misfit_px=of.misfit_px,
         ended_by=track.ended_by,
         ahead=_ahead(of.steps, dynamics, settings.latency, float(of.size[0])),
     )
 
 
-def _as_they_were(
-    tracks: Sequence[Track], camera: GroundCamera, settings: TrackerSettings, dynamics: Dynamics
-) -> list[_Settled]:
+def _as_they_were(tracks: Sequence[Track]) -> list[_Settled]:
     """What was known of each track in each of its frames."""
     found = []
     for track in tracks:
@@ -133,10 +140,10 @@ def _as_they_were(
 
 
 def _settled(
-    tracks: Sequence[Track], camera: GroundCamera, settings: TrackerSettings, dynamics: Dynamics
+    tracks: Sequence[Track], camera: GroundCamera, settings: TrackerSettings, dynamics: Dynamics, fall: Array | None
 ) -> list[_Settled]:
     """What all of each track says of it."""
-    fitted = [_fitted(track, camera, settings, dynamics) for track in tracks]
+    fitted = [_fitted(track, camera, settings, dynamics, fall) for track in tracks]
     poses = [
         settled_poses(track.samples, track.steps, fit, pose, sized.size, dynamics)
         for track, (sized, pose, fit) in zip(tracks, fitted, strict=True)
@@ -152,7 +159,7 @@ def _settled(
 
 
 def _fitted(
-    track: Track, camera: GroundCamera, settings: TrackerSettings, dynamics: Dynamics
+    track: Track, camera: GroundCamera, settings: TrackerSettings, dynamics: Dynamics, fall: Array | None
 ) -> tuple[measure.Sized, Array, measure.BoxFit]:
     """A track's class and size, its poses (T, 3) as they are smoothed with what was known, and boxes fitted anew."""
     heading = dynamics.heading(dynamics_tools.smooth(dynamics, track.steps).mean)
@@ -160,6 +167,8 @@ def _fitted(
     pose = np.column_stack([rough[:, :2], heading])
     outlines = Outlines.stack([sample.outline for sample in track.samples])
     used = np.array([sample.measured for sample in track.samples])
+    if fall is not None:
+        outlines = sills.on_the_ground(outlines, used, camera, pose, track.size, fall)
     classes = settings.target.classes
     sized = measure.classify(camera, outlines[used], pose[used], classes, settings.pose, measure.pooled_size)[0]
     return sized, pose, measure.fit_poses(camera, outlines, pose, sized.size, np.full(3, 0.01), settings.pose)

@@ -136,7 +136,7 @@ class BoxEvidence:
         for region, thing in self._pairs(pose, size)[0]:
             seen[thing] = self._sides(region)
             share[thing] = 1.0
-        return Look(Outlines.stack(seen), share, share, share, share, share, share, share)
+        return Look(Outlines.stack(seen), share, share, share, share, 0 * share, share, share, share)
 
     def probe(self, pose: Array, size: Array, reach: Array, taken: Boxes) -> Look:
         free = set(self._pairs(*taken)[1].tolist())
@@ -148,7 +148,7 @@ class BoxEvidence:
                 if iou[best, thing] >= LEAST_IOU:
                     seen[thing] = self._sides(best)
                     share[thing] = 1.0
-        return Look(Outlines.stack(seen), share, share, share, share, share, share, share)
+        return Look(Outlines.stack(seen), share, share, share, share, 0 * share, share, share, share)
 
     def outlines(self, pose: Array, size: Array, reach: Array, taken: Boxes) -> Outlines:
         return self.probe(pose, size, reach, taken).outlines

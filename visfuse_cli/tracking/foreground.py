@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 from pydantic import Field
@@ -13,7 +13,7 @@ from visfuse_cli.records import Array, Boxes, GroundCamera
 from visfuse_cli.tracking.evidence import BoxEvidence, Evidence, LabelEvidence
 from visfuse_cli.tracking.ground import GroundTracker
 from visfuse_cli.tracking.lookout import Seen
-from visfuse_cli.tracking.sun import Shade, Sun, shadow_picture
+from visfuse_cli.tracking.sun import Shade, Shadow, Sun, shadow_picture
 from visfuse_cli.tracking.zones import Region
 from visfuse_cli.vision import regions as region_tools
 from visfuse_cli.vision.steady import moved
@@ -37,8 +37,9 @@ class Detector(Protocol):
     def learn(self, t: float, tracker: GroundTracker) -> None:
         """Learn from what is followed in the frame at t (s) that evidence was given of."""
 
-    def report(self) -> dict[str, Any] | None:
-        """Where the sun stands, where that was found."""
+    @property
+    def shadow(self) -> Shadow | None:
+        """Where shadows fall, where that was found."""
 
 
 class MovingRegions:
@@ -68,8 +69,9 @@ class MovingRegions:
         settled = np.array([len(t.samples) >= SETTLED and t.samples[-1].measured for t in tracker.tracks], dtype=bool)
         self._sun.look(t, self._labels, pose, size, settled, [track.id for track in tracker.tracks])
 
-    def report(self) -> dict[str, Any] | None:
-        return None if self._sun.shadow is None else self._sun.shadow.report()
+    @property
+    def shadow(self) -> Shadow | None:
+        return self._sun.shadow
 
 
 class Detections:
@@ -98,5 +100,6 @@ class Detections:
     def learn(self, t: float, tracker: GroundTracker) -> None:
         """Boxes from outside cast no shadows."""
 
-    def report(self) -> dict[str, Any] | None:
+    @property
+    def shadow(self) -> Shadow | None:
         return None

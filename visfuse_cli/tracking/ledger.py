@@ -65,13 +65,19 @@ class Ledger:
         return list(self._speeds.values())
 
     def take(
-        self, tracks: Sequence[Track], of: Recording, dynamics: Dynamics, only_light: Callable[[int], bool]
+        self,
+        tracks: Sequence[Track],
+        of: Recording,
+        dynamics: Dynamics,
+        only_light: Callable[[int], bool],
+        fall: Array | None,
     ) -> Iterator[Taken]:
         """Conclude and judge tracks; but those that never were in the region come out.
 
-        `only_light` tells of an id whether no more than lamps was seen of it.
+        `only_light` tells of an id whether no more than lamps was seen of it; shadows fall `fall` (2,) m for a metre of
+        height, where that is known.
         """
-        for whole in conclude(tracks, of.camera, self._config, dynamics):
+        for whole in conclude(tracks, of.camera, self._config, dynamics, fall):
             taken = self._judged(whole, of, only_light(whole.id))
             if taken is not None:
                 yield taken

@@ -19,7 +19,7 @@ REVERSES = 6.0  # m/s: what goes backwards faster is something else, which came 
 class Sample:
     """One frame of a target: its outline, and shares of what nothing hides (NaN: all is hidden).
 
-    border: of the border that could be found, what was; apart and paint as in `Look`.
+    border: of the border that could be found, what was; apart, paint and shaded as in `Look`.
     """
 
     frame: int
@@ -29,11 +29,13 @@ class Sample:
     measured: bool
     apart: float = 1.0
     paint: float = 1.0
+    shaded: float = 0.0
 
     @classmethod
     def of(cls, frame: int, t: float, look: Look, k: int, border: Array, measured: bool) -> Sample:
         """The k-th of the boxes that were looked for, border (N,) of each found."""
-        return cls(frame, t, look.outlines[k], float(border[k]), measured, float(look.apart[k]), float(look.paint[k]))
+        shares = (float(share[k]) for share in (look.apart, look.paint, look.shaded))
+        return cls(frame, t, look.outlines[k], float(border[k]), measured, *shares)
 
 
 def velocity_at_start(samples: list[Sample], pose: Array) -> Array:

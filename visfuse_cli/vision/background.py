@@ -48,7 +48,7 @@ class Background:
         self._learnt_t = 0.0
         self._picture: Image | None = None
         self._grey: Image | None = None
-        self._mean: NDArray[np.float32]  # the picture before it is rounded: what it changes by is less than a grey level
+        self._mean: NDArray[np.float32]  # the picture before it is rounded: it changes by less than a grey level
         self._labels: Image | None = None
         self._corrected: Image | None = None  # 255 where a ghost was taken out of the picture; the model learns slowly
         self._compared: tuple[float, Image, Image] | None = None  # t, grey picture and labels when ghosts were sought

@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from visfuse_cli.records import Array, GroundCamera, Image
-from visfuse_cli.vision.background import FOREGROUND
+from visfuse_cli.vision import wireframe
+from visfuse_cli.vision.background import FOREGROUND, SHADOW
 from visfuse_cli.vision.labels import Labels
 from visfuse_cli.vision.lens import distort_points
 from visfuse_cli.vision.wireframe import DIRECTIONS, EDGES, Outlines, projected, silhouette_edges
@@ -26,6 +27,8 @@ NOWHERE = -128  # fewer votes than any border has
 CLEAR_PX = 2.5  # between a border and the background outside it
 SOLID = 0.8  # of what lies inside a border must be paint to take what lies outside for shadow
 GROUND_EDGES = 4  # the first of the EDGES lie on the ground
+SILL_M, SILL_STEPS = 0.6, 24  # m below the paint at which the ground is looked for, where it is dark there
+STEEP = 0.4  # cosine of a border's normal and what is down in the picture, at least
 OPEN = 0.7  # of a profile that must be visible to expect a border in it
 BEYOND = 0.12  # of a silhouette's width: how far out the border of a box that is too small may lie
 LEAST = 0.1  # of a border or an area that must be visible to say anything about it
@@ -62,8 +65,8 @@ class Look:
 
     border: of the border, what was found; likeness: the same, of what does not lie in the midst of paint; clear: of
     the found border, what has background outside and not shadow or paint; foot: of the border on the ground, what was
-    found; moved: of the area, what differs from the background; paint: of the area, what differs and is no shadow;
-    open: of the area, what is in view.
+    found; shaded: of the found border on the ground, what stands in shadow; moved: of the area, what differs from the
+    background; paint: of the area, what differs and is no shadow; open: of the area, what is in view.
     """
 
     outlines: Outlines
@@ -71,6 +74,7 @@ class Look:
     likeness: Array
     clear: Array
     foot: Array
+    shaded: Array
     moved: Array
     paint: Array
     open: Array
@@ -117,6 +121,7 @@ class Profiles:
     paint: NDArray[np.bool_]
     ground: NDArray[np.bool_]
     clear: NDArray[np.bool_]
+    dark: NDArray[np.bool_]
 
 
 def profiles(
@@ -143,9 +148,10 @@ def profiles(
     valid = np.isfinite(nearest)
     support = _dot(normal, at) + np.where(valid, nearest, 0.0)
     rows = np.ascontiguousarray(np.moveaxis(normal, 0, -1))
-    outlines = Outlines(rows, support, EDGES[edge], share, valid, np.zeros(len(pose), dtype=bool), total / np.pi)
-    clear = valid & (under | (np.abs(found[1] - nearest) < CLEAR_PX))
-    return Profiles(outlines, middle, at, normal, known, paint, ground, clear)
+    none, unknown = np.zeros(len(pose), dtype=bool), np.full(valid.shape, np.nan)
+    outlines = Outlines(rows, support, EDGES[edge], share, valid, none, total / np.pi, unknown)
+    alone = np.abs(found[1] - nearest) < CLEAR_PX
+    return Profiles(outlines, middle, at, normal, known, paint, ground, valid & (under | alone), valid & ~alone)
 
 
 def search(
@@ -174,6 +180,7 @@ def search(
         again = np.flatnonzero(missing.any(axis=1) & (far > reach))
         wide = profiles(sights, code[again], camera, pose[again], size[again], far[again]).outlines
         outlines = _completed(outlines, again, missing[again], wide)
+    outlines = replace(outlines, dark=_dark(sights, code, camera, pose, size, outlines, across))
     label, whose, inside = _look(sights, camera, _spokes(across.middle, across.at, _RADII))
     own = inside & (whose == code[:, None, None])
     area = _areas(across.middle, across.at, across.normal)[..., None] * np.ones(len(_RADII))
@@ -184,10 +191,35 @@ def search(
         likeness=_share(valid & in_view, told, 1 / DIRECTIONS),
         clear=_share(across.clear, valid, 1 / DIRECTIONS),
         foot=_share(valid & in_view & ground, in_view & ground, 1 / DIRECTIONS),
+        shaded=_share(across.dark & ground, valid & ground, 1 / DIRECTIONS),
         moved=_share(own & (label > 0), own, area),
         paint=_share(own & (label == FOREGROUND), own, area),
         open=np.sum(own * area, axis=(1, 2)),
     )
+
+
+def _dark(
+    sights: Sequence[Sight],
+    code: NDArray[np.intp],
+    camera: GroundCamera,
+    pose: Array,
+    size: Array,
+    outlines: Outlines,
+    across: Profiles,
+) -> Array:
+    """How high (N, K) m that is which looks like shadow and begins at the border on the ground: see `Outlines`."""
+    down = _dot(across.normal, wireframe.downwards(camera, pose, size)[..., None])  # px for a metre
+    border = across.at + across.normal * (outlines.support - _dot(across.normal, across.at))
+    depth = (np.arange(SILL_STEPS) + 1) * (SILL_M / SILL_STEPS)
+    label, whose, inside = _look(sights, camera, border[..., None] + (across.normal * down)[..., None] * depth)
+    known = inside & ((whose == 0) | (whose == code[:, None, None]))
+    dark = known & (label == SHADOW)
+    end = np.argmin(dark, axis=-1)  # the first place that is not
+    n, k = np.ogrid[: len(pose), : label.shape[1]]
+    ends = known[n, k, end] & (label[n, k, end] == 0)
+    height = np.where(dark.all(axis=-1), np.inf, np.where(ends & (end > 0), depth[end] - depth[0] / 2, np.nan))
+    told = outlines.valid & across.ground & (down > STEEP * _length(wireframe.downwards(camera, pose, size))[:, None])
+    return np.where(told, height, np.nan)
 
 
 def _completed(outlines: Outlines, which: NDArray[np.intp], missing: NDArray[np.bool_], wide: Outlines) -> Outlines:

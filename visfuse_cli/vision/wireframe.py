@@ -44,8 +44,9 @@ class Outlines:
     """Rows of N outlines: model point (1 - share) corner[0] + share corner[1] was seen `support` px along `normal`.
 
     normal (N, K, 2), support (N, K), corner (N, K, 2), share (N, K), valid (N, K): the thing's own border was seen;
-    tangent (N,): the corner is whichever lies outermost; width (N,) px: mean width of the outline. One outline has
-    the same fields without the first axis.
+    tangent (N,): the corner is whichever lies outermost; width (N,) px: mean width of the outline; dark (N, K) m: how
+    high above its end that begins where the row was seen which looks like shadow, inf where no end is near, NaN where
+    nothing dark begins. One outline has the same fields without the first axis.
     """
 
     normal: Array
@@ -55,6 +56,7 @@ class Outlines:
     valid: np.ndarray
     tangent: np.ndarray
     width: Array
+    dark: Array
 
     def __getitem__(self, which: object) -> Outlines:
         return Outlines(*(getattr(self, name)[which] for name in self.__dataclass_fields__))
@@ -161,6 +163,12 @@ def _linearised(seen: Array, x: Array, slopes: Array) -> Array:
     return image[:, :, :2].reshape(len(x), 7, 16)
 
 
+def downwards(camera: GroundCamera, pose: Array, size: Array) -> Array:
+    """What a metre down is in the picture (2, N) px, beside N boxes."""
+    pixels = projected(camera, pose, size)
+    return np.asarray((pixels[..., :4] - pixels[..., 4:]).mean(axis=2) / size[:, 2])
+
+
 def silhouette_edges(camera: GroundCamera, pose: Array, size: Array) -> np.ndarray:
     """Which of the EDGES (N, 12) border the silhouette: one of the two faces that meet there is seen, one is not."""
     offset = camera.centre - np.concatenate([pose[:, :2], np.zeros((len(pose), 1))], axis=1)
@@ -195,7 +203,8 @@ def tangents(hull: Array, at_border: np.ndarray, upright: bool = False, border_p
     support = reach[outermost, np.arange(DIRECTIONS)] + border_px
     nowhere = np.zeros((DIRECTIONS, 2), dtype=int)
     width = np.asarray(2 * support.mean())
-    return Outlines(FAN, support, nowhere, np.zeros(DIRECTIONS), valid, np.asarray(True), width)
+    unknown = np.full(DIRECTIONS, np.nan)
+    return Outlines(FAN, support, nowhere, np.zeros(DIRECTIONS), valid, np.asarray(True), width, unknown)
 
 
 def fit(

@@ -74,7 +74,7 @@ def follow(clip: Clip, run_: Run, spool: TrackSpool, findings: Findings, first_i
             detector, lamps = _detector(clip), Headlights(empty, clip.camera)
         tracker = GroundTracker(clip.camera, clip.config, first_id)
         of = Recording(clip.name, label, clip.camera, findings.began[clip.name], motions.image_from_rest)
-        settling = _Settling(of, tracker, lamps, run_, spool, findings.ledger)
+        settling = _Settling(of, tracker, detector, lamps, run_, spool, findings.ledger)
         lookout = begin(look_out, clip.footage, clip.camera, empty, _comparing(clip), lag=FORESEEN)
         for seen in run_.until_stopped(lookout, clip.source.frame_count):
             run_.count("frames")
@@ -99,7 +99,7 @@ def follow(clip: Clip, run_: Run, spool: TrackSpool, findings: Findings, first_i
         settling.take(*tracker.finish(), last=True)
         audit, log = lookout.finish()
     give_back()
-    findings.suns[clip.name] = detector.report()
+    findings.suns[clip.name] = None if detector.shadow is None else detector.shadow.report()
     findings.audits[clip.name], findings.cameras[clip.name] = audit, log
     for warning in (*audit.warnings, *log.warnings(clip.name)):
         run_.warn(warning)
@@ -149,6 +149,7 @@ class _Settling:
 
     of: Recording
     tracker: GroundTracker
+    detector: Detector
     lamps: Headlights
     run: Run
     spool: TrackSpool
@@ -162,7 +163,10 @@ class _Settling:
             self.run.count("regions that never became a track")
         self.waiting += tracks
         if self.waiting and (last or sum(len(track.samples) for track in self.waiting) >= TOGETHER):
-            for taken in self.ledger.take(self.waiting, self.of, self.tracker.dynamics, self.lamps.only_light):
+            shadow = self.detector.shadow
+            fall = None if shadow is None else shadow.per_metre
+            lit = self.lamps.only_light
+            for taken in self.ledger.take(self.waiting, self.of, self.tracker.dynamics, lit, fall):
                 self.spool.add(taken.record)
                 self.run.count("rejected" if taken.record["summary"]["rejected"] else "vehicles")
                 for identity in taken.displaced:
