@@ -16,9 +16,8 @@ from visfuse_cli.vision import wireframe
 from visfuse_cli.vision.wireframe import Outlines
 
 LEAST_ROWS = 12
-LOW_M = 0.12  # what is less high may be the rim of a border
-ALIKE = 0.5  # of its height that half of the rows may differ by
-ENDS = 2.0  # times as many rows must tell where it ends as do not: they may lie in the shadow of something else
+LOW_M = 0.17  # what is less high may be the rim of a border
+ALIKE = 0.5  # of its height that half of the rows may differ by; less where some lie in the shadow of something else
 _SIDES = wireframe.corners(np.zeros(3), 2 * np.ones(3))[:, :2]
 
 
@@ -41,7 +40,8 @@ def on_the_ground(
 def _height(dark: Array) -> float:
     """How high (m) the dark is by the rows (n,) that begin in it (see `Outlines`); 0 where it may be a shadow."""
     told, endless = dark[np.isfinite(dark)], np.count_nonzero(np.isinf(dark))
-    if len(told) < max(LEAST_ROWS, ENDS * endless):
+    if len(told) < LEAST_ROWS:
         return 0.0
     low, middle, high = np.quantile(told, (0.25, 0.5, 0.75))
-    return float(middle) if middle > LOW_M and high - low < ALIKE * middle else 0.0
+    alike = high - low < ALIKE * middle * len(told) / (len(told) + endless)
+    return float(middle) if middle > LOW_M and alike else 0.0
