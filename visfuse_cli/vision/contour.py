@@ -208,18 +208,18 @@ def _dark(
     across: Profiles,
 ) -> Array:
     """How high (N, K) m that is which looks like shadow and begins at the border on the ground: see `Outlines`."""
-    down = _dot(across.normal, wireframe.downwards(camera, pose, size)[..., None])  # px for a metre
+    down = wireframe.downwards(camera, pose, size)
+    steep = _dot(across.normal, down[..., None])  # px along the normal for a metre down
     border = across.at + across.normal * (outlines.support - _dot(across.normal, across.at))
     depth = (np.arange(SILL_STEPS) + 1) * (SILL_M / SILL_STEPS)
-    label, whose, inside = _look(sights, camera, border[..., None] + (across.normal * down)[..., None] * depth)
+    label, whose, inside = _look(sights, camera, border[..., None] + (across.normal * steep)[..., None] * depth)
     known = inside & ((whose == 0) | (whose == code[:, None, None]))
     dark = known & (label == SHADOW)
-    end = np.argmin(dark, axis=-1)  # the first place that is not
-    n, k = np.ogrid[: len(pose), : label.shape[1]]
-    ends = known[n, k, end] & (label[n, k, end] == 0)
-    height = np.where(dark.all(axis=-1), np.inf, np.where(ends & (end > 0), depth[end] - depth[0] / 2, np.nan))
-    told = outlines.valid & across.ground & (down > STEEP * _length(wireframe.downwards(camera, pose, size))[:, None])
-    return np.where(told, height, np.nan)
+    end = np.argmin(dark, axis=-1)[..., None]  # the first place that is not
+    found = (end > 0) & np.take_along_axis(known & (label == 0), end, axis=-1)
+    ended = np.where(found, depth[end] - depth[0] / 2, np.nan)[..., 0]
+    asked = outlines.valid & across.ground & (steep > STEEP * _length(down)[:, None])
+    return np.where(asked, np.where(dark.all(axis=-1), np.inf, ended), np.nan)
 
 
 def _completed(outlines: Outlines, which: NDArray[np.intp], missing: NDArray[np.bool_], wide: Outlines) -> Outlines:
