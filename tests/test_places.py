@@ -1,5 +1,6 @@
 """Places on the ground: polygons, the region of interest, the trusted zone, a plane above the surveyed one."""
 
+from copy import deepcopy
 from dataclasses import replace
 
 import numpy as np
@@ -9,11 +10,10 @@ from masks import CAR, drive, evidence_of, labels_of, road_camera
 from visfuse_cli.maths.cameras import elevation, project, raised
 from visfuse_cli.maths.homography import apply
 from visfuse_cli.maths.polygons import area, contains, distance, surrounding
-from visfuse_cli.tracking.conclude import conclude
+from visfuse_cli.tracking.conclude import CLEARANCE, SILL_DOUBT_M, conclude
 from visfuse_cli.tracking.ground import GroundTracker
 from visfuse_cli.tracking.settings import TrackerSettings
 from visfuse_cli.tracking.verdict import (
-    CLEARANCE,
     LEAST_DOUBT,
     LIKE_A_PART,
     MOST_DOUBT,
@@ -169,7 +169,7 @@ def test_the_interval_knows_how_well_the_box_fits_and_what_speaks_for_a_track_do
 
     def own(**changed):
         verdict = judged(**changed)[0]
-        return np.sqrt(verdict.sigma**2 - (CLEARANCE * verdict.speed) ** 2)
+        return np.sqrt(verdict.sigma**2 - (path.clearance * verdict.speed) ** 2)
 
     usual, well = judged(misfit_px=USUAL_MISFIT_PX, apart=1.0)
     off, badly = judged(misfit_px=2 * USUAL_MISFIT_PX, apart=1.0)
@@ -180,6 +180,22 @@ def test_the_interval_knows_how_well_the_box_fits_and_what_speaks_for_a_track_do
     assert own(misfit_px=0.01, apart=1.0) == pytest.approx(LEAST_DOUBT * usual.noise)
     assert own(misfit_px=99.0, apart=0.5) == pytest.approx(MOST_DOUBT * usual.noise)
     assert own(misfit_px=np.nan) == pytest.approx(usual.noise)  # no box was fitted again
+
+
+def test_where_it_stands_in_shadow_it_is_less_known_where_a_vehicle_meets_the_ground(passing):
+    _, settings, tracker, (whole,) = passing
+    track, found = deepcopy(whole), []
+    for shaded in (0.0, 1.0):
+        for sample in track.samples:
+            sample.shaded = shaded
+        (path,) = conclude([track], CAMERA, settings, tracker.dynamics)
+        found.append((path.clearance, judge(path, 0 * CAMERA.ground.cov, 1.0, SpeedSettings(), path.measured)))
+    (sure, usual), (doubt, doubtful) = found
+    assert sure == CLEARANCE
+    assert doubt == pytest.approx(np.hypot(CLEARANCE, SILL_DOUBT_M / CAMERA.centre[2]))
+    assert doubtful.speed == usual.speed
+    more = (doubt**2 - sure**2) * usual.speed**2
+    assert doubtful.sigma**2 - usual.sigma**2 == pytest.approx(more)
 
 
 def test_what_is_slim_must_be_seen_better_and_of_all_else_an_odd_size(passing):

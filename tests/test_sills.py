@@ -2,10 +2,12 @@
 
 import cv2
 import numpy as np
-from masks import CAR, evidence_of, labels_of, road_camera
+from masks import CAR, drive, evidence_of, labels_of, road_camera
 
 from visfuse_cli.tracking import measure, sills
-from visfuse_cli.tracking.settings import PoseSettings
+from visfuse_cli.tracking.conclude import conclude
+from visfuse_cli.tracking.ground import GroundTracker
+from visfuse_cli.tracking.settings import PoseSettings, TrackerSettings
 from visfuse_cli.vision import wireframe
 from visfuse_cli.vision.background import FOREGROUND
 from visfuse_cli.vision.wireframe import Outlines
@@ -81,3 +83,20 @@ def test_paint_down_to_the_ground_has_nothing_dark_beneath():
     evidence = evidence_of(CAMERA, labels_of(CAMERA, [(POSES[0], CAR)]))
     look = evidence.probe(POSES[:1], CAR[None], np.array([8.0]), NOBODY)
     assert np.isnan(look.outlines.dark).all()
+
+
+def test_a_car_in_low_sun_is_as_fast_as_it_is():
+    truth = drive((-1, 14), (0.4, 9), np.arange(60) / 25)
+    tracker, tracks = GroundTracker(CAMERA, TrackerSettings()), []
+    for k, pose in enumerate(truth):
+        tracker.predict(k / 25)
+        tracks += tracker.update(k, evidence_of(CAMERA, sight(pose)))[0]
+    (track,) = tracks + tracker.finish()[0]
+
+    def speed(fall):
+        (path,) = conclude([track], CAMERA, tracker.settings, tracker.dynamics, fall)
+        end = path.planar.mean[[8, -8], 1]
+        return (end[1] - end[0]) / (path.t[-8] - path.t[8])
+
+    assert speed(None) > 9 * (1 + 0.7 * SILL_M / CAMERA.centre[2])
+    np.testing.assert_allclose(speed(AWAY), 9.0, rtol=0.01)

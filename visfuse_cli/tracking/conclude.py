@@ -20,6 +20,9 @@ from visfuse_cli.tracking.settings import TrackerSettings
 from visfuse_cli.tracking.targets import Track
 from visfuse_cli.vision.wireframe import Outlines
 
+CLEARANCE = 0.003  # of a way: how much further away than it is a vehicle may be seen to stand
+SILL_DOUBT_M = 0.10  # the same above the ground, in shadow
+
 
 @dataclass(frozen=True, slots=True)
 class Path:
@@ -52,7 +55,7 @@ class Path:
     support: float  # the same, of all of it: what is hidden, out of the picture or amidst others counts
     apart: float  # mean share of the outline that does not lie in the midst of paint
     paint: float  # mean share of the area that was paint, neither shadow nor as the empty road is
-    shaded: float  # mean share of the outline on the ground that stands in shadow
+    clearance: float  # deviation of a way, as a share of it, for where a vehicle meets the ground
     misfit_px: float
     ended_by: str
     ahead: Array  # (T, 2) m: where it was expected a latency later, from what was known then
@@ -121,7 +124,7 @@ def _path(track: Track, of: _Settled, camera: GroundCamera, settings: TrackerSet
         support=float(np.mean([s.outline.tangent or s.outline.valid.mean() for s in samples if s.measured])),
         apart=_mean([s.apart for s in samples if s.measured]),
         paint=_mean([s.paint for s in samples if s.measured]),
-        shaded=_mean([s.shaded for s in samples if s.measured]),
+        clearance=_clearance(_mean([s.shaded for s in samples if s.measured]), camera),
         misfit_px=of.misfit_px,
         ended_by=track.ended_by,
         ahead=_ahead(of.steps, dynamics, settings.latency, float(of.size[0])),
@@ -187,6 +190,12 @@ def _size_z(size: Array, class_name: str, settings: TrackerSettings) -> float:
     prior = next(c for c in settings.target.classes if c.name == class_name)
     mean, sigma = measure.prior_arrays(prior)
     return float(np.linalg.norm((size - mean) / sigma))
+
+
+def _clearance(shaded: float, camera: GroundCamera) -> float:
+    """Tyres and the dark beneath hide the ground, and where it lies in shadow (a share of the outline) sills may be
+    taken for it: what ends above the ground seems to be further away, and to go faster."""
+    return float(np.hypot(CLEARANCE, shaded * SILL_DOUBT_M / camera.centre[2]))
 
 
 def _mean(shares: list[float]) -> float:

@@ -28,9 +28,8 @@ UNSEEN_S = 1.5  # s: a stretch goes over no longer gap
 JUMP_S = 0.3  # s a change of speed is looked at
 SUDDEN = 2.0  # times as much as it is counts what a vehicle gains: it cannot as fast as it brakes
 WANDER_PX, WANDER_S = 0.6, 2.0  # px by which outlines lie off, and s for which they do: noise that frames share
-USUAL_MISFIT_PX, AMIDST = 1.8, 10.0  # rms misfit of an outline; what a share of it amidst others adds to its logarithm
-LEAST_DOUBT, MOST_DOUBT = 0.4, 2.5  # times as far as usual that outlines lie off
-CLEARANCE = 0.003  # of a way: where tyres and the dark beneath hide the ground, it is measured a little above it
+USUAL_MISFIT_PX, AMIDST = 2.2, 10.0  # rms misfit of an outline; what a share of it amidst others adds to its logarithm
+LEAST_DOUBT, MOST_DOUBT = 0.33, 2.5  # times as far as usual that outlines lie off
 
 
 class SpeedSettings(Section):
@@ -141,7 +140,7 @@ def _best_stretch(
     good = doubt <= max(LONGER_FOR * float(doubt.min()), GOOD_ENOUGH)
     best = int(np.argmax(np.where(good, distance, -np.inf)))
     took, noise = max(duration[best], 1e-9), float(np.sqrt(own[best]))
-    shared = calibration[best] + (CLEARANCE * distance[best]) ** 2
+    shared = calibration[best] + (path.clearance * distance[best]) ** 2
     sigma = float(np.sqrt((_doubt_of_outline(path) * noise) ** 2 + shared))
     return int(i[best]), int(j[best]), sigma / took, noise / took
 

@@ -217,9 +217,9 @@ def _dark(
     dark = known & (label == SHADOW)
     end = np.argmin(dark, axis=-1)[..., None]  # the first place that is not
     found = (end > 0) & np.take_along_axis(known & (label == 0), end, axis=-1)
-    ended = np.where(found, depth[end] - depth[0] / 2, np.nan)[..., 0]
+    height = np.where(found, depth[end] - depth[0] / 2, np.where(end > 0, np.inf, np.nan))[..., 0]
     asked = outlines.valid & across.ground & (steep > STEEP * _length(down)[:, None])
-    return np.where(asked, np.where(dark.all(axis=-1), np.inf, ended), np.nan)
+    return np.where(asked, np.where(dark.all(axis=-1), np.inf, height), np.nan)
 
 
 def _completed(outlines: Outlines, which: NDArray[np.intp], missing: NDArray[np.bool_], wide: Outlines) -> Outlines:

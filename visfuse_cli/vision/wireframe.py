@@ -45,7 +45,7 @@ class Outlines:
 
     normal (N, K, 2), support (N, K), corner (N, K, 2), share (N, K), valid (N, K): the thing's own border was seen;
     tangent (N,): the corner is whichever lies outermost; width (N,) px: mean width of the outline; dark (N, K) m: how
-    high above its end that begins where the row was seen which looks like shadow, inf where no end is near, NaN where
+    high above its end that begins where the row was seen which looks like shadow, inf where no end is seen, NaN where
     nothing dark begins. One outline has the same fields without the first axis.
     """
 
