@@ -210,7 +210,8 @@ def opened(
     request: RunRequest, inputs: Iterable[dict[str, Any]], frame_of_reference: str
 ) -> Iterator[tuple[Path, Run, TrackSpool]]:
     """One run and what it writes to: its folder, held and cleared, and tracks.json. `inputs` are as described."""
-    gc.freeze()  # what was imported stays: to look through it for garbage took longer than all that a run makes
+    if not gc.get_freeze_count():
+        gc.freeze()  # what was imported stays: to look through it for garbage took longer than all else
     with (
         RunFolder(request.out, request.overwrite, inputs=[request.input, *paths_of(inputs)]) as folder,
         Run(request.progress) as run,
