@@ -1,4 +1,4 @@
-"""The dark beneath a vehicle: told from the sun's shadow by the side it is on, and taken for a part of the vehicle."""
+"""What is beneath a vehicle's paint: told from the sun's shadow by the side it is on, or seen again below a gap."""
 
 import cv2
 import numpy as np
@@ -19,25 +19,38 @@ SILL_M = 0.25
 AWAY, NEARER = np.array([0.1, 4.0]), np.array([0.1, -4.0])  # where shadows fall: the sun behind the camera, and before
 
 
+def fill_above(labels, pose, height, label):
+    """Draw a car but for what is lower."""
+    box = wireframe.corners(pose, CAR)
+    box[:4, 2] = height
+    image = np.column_stack([box, np.ones(8)]) @ CAMERA.image_from_world.T
+    hull = cv2.convexHull((image[:, :2] / image[:, 2:]).astype(np.float32))
+    cv2.fillConvexPoly(labels, np.round(hull * 16).astype(np.int32), label, shift=4)
+
+
 def sight(pose, shade=()):
     """Labels of a car whose lowest part looks like shadow."""
     labels = labels_of(CAMERA, [], [*shade, (pose, CAR)])
-    box = wireframe.corners(pose, CAR)
-    box[:4, 2] = SILL_M
-    image = np.column_stack([box, np.ones(8)]) @ CAMERA.image_from_world.T
-    hull = cv2.convexHull((image[:, :2] / image[:, 2:]).astype(np.float32))
-    cv2.fillConvexPoly(labels, np.round(hull * 16).astype(np.int32), FOREGROUND, shift=4)
+    fill_above(labels, pose, SILL_M, FOREGROUND)
     return labels
 
 
-def seen(shade=()):
+def gap(pose, bumper=True):
+    """Labels of a car of which a band looks like the road, and, if it has one, a bumper below that does not."""
+    labels = labels_of(CAMERA, [(pose, CAR)] if bumper else [])
+    fill_above(labels, pose, 0.12, 0)
+    fill_above(labels, pose, SILL_M, FOREGROUND)
+    return labels
+
+
+def seen(shade=(), draw=None):
     """The outlines of a car that was taken for what is painted of it, and its poses then: further away."""
     poses, looks = [], []
     for pose in POSES:
         back = pose.copy()
         back[:2] += (pose[:2] - CAMERA.centre[:2]) * SILL_M / CAMERA.centre[2]
-        labels = sight(pose, [(pose + off, size) for off, size in shade])
-        look = evidence_of(CAMERA, labels).probe(back[None], (CAR - [0, 0, SILL_M])[None], np.array([8.0]), NOBODY)
+        labels = draw(pose) if draw else sight(pose, [(pose + off, size) for off, size in shade])
+        look = evidence_of(CAMERA, labels).probe(back[None], (CAR - [0, 0, SILL_M])[None], np.array([5.0]), NOBODY)
         poses.append(back)
         looks.append(look)
     return Outlines.joined([look.outlines for look in looks]), np.array(poses)
@@ -83,6 +96,13 @@ def test_paint_down_to_the_ground_has_nothing_dark_beneath():
     evidence = evidence_of(CAMERA, labels_of(CAMERA, [(POSES[0], CAR)]))
     look = evidence.probe(POSES[:1], CAR[None], np.array([8.0]), NOBODY)
     assert np.isnan(look.outlines.dark).all()
+
+
+def test_a_bumper_below_a_gap_is_the_vehicles_own():
+    outlines, poses = seen(draw=gap)
+    assert astray(outlines, poses) > 0.3
+    assert abs(astray(lowered(outlines, poses, None), poses)) < 0.15
+    assert lowered(*(without := seen(draw=lambda pose: gap(pose, bumper=False))), None) is without[0]
 
 
 def test_a_car_in_low_sun_is_as_fast_as_it_is():

@@ -27,7 +27,7 @@ def tangent_rows(support, valid):
     nowhere = np.zeros((n, DIRECTIONS, 2), dtype=int)
     width = 2 * support.mean(axis=1)
     none, every = 0.0 * support, np.ones(n, dtype=bool)
-    return Outlines(np.tile(FAN, (n, 1, 1)), support, nowhere, none, valid, every, width, np.nan * support)
+    return Outlines(np.tile(FAN, (n, 1, 1)), support, nowhere, none, valid, every, width, np.nan * support, none)
 
 
 def fit(camera, outlines, start, size, size_sigma, sigma_px=1.5):

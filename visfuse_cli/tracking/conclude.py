@@ -170,8 +170,7 @@ def _fitted(
     pose = np.column_stack([rough[:, :2], heading])
     outlines = Outlines.stack([sample.outline for sample in track.samples])
     used = np.array([sample.measured for sample in track.samples])
-    if fall is not None:
-        outlines = sills.on_the_ground(outlines, used, camera, pose, track.size, fall)
+    outlines = sills.on_the_ground(outlines, used, camera, pose, track.size, fall)
     classes = settings.target.classes
     sized = measure.classify(camera, outlines[used], pose[used], classes, settings.pose, measure.pooled_size)[0]
     return sized, pose, measure.fit_poses(camera, outlines, pose, sized.size, np.full(3, 0.01), settings.pose)

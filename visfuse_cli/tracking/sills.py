@@ -1,7 +1,8 @@
-"""The dark beneath a vehicle: sills and bumpers in their own shade look like a shadow on the ground, but end above it.
+"""What lies beneath the border that was found of a vehicle and is its own: dark sills, and bumpers below a gap.
 
-On the side of a vehicle that faces the sun there is no shadow of it: what is dark there all along, at one height, is
-its own, and the ground begins below it, on its other sides as well.
+Sills in their own shade look like a shadow on the ground. On the side of a vehicle that faces the sun there is no
+shadow of it: what is dark there all along, at one height, is its own. And where a panel is as grey as the road, what is
+below it, all along at one height, belongs to the vehicle as well. The ground begins below either, on all sides.
 """
 
 from __future__ import annotations
@@ -17,31 +18,47 @@ from visfuse_cli.vision.wireframe import Outlines
 
 LEAST_ROWS = 12
 LOW_M = 0.17  # what is less high may be the rim of a border
-ALIKE = 0.5  # of its height that half of the rows may differ by; less where some lie in the shadow of something else
+ALIKE = 0.5  # of its height that half of the rows may differ by; less where some do not tell it
+MOST = 0.5  # of the rows must see paint below a gap
 _SIDES = wireframe.corners(np.zeros(3), 2 * np.ones(3))[:, :2]
 
 
 def on_the_ground(
-    outlines: Outlines, used: NDArray[np.bool_], camera: GroundCamera, pose: Array, size: Array, fall: Array
+    outlines: Outlines, used: NDArray[np.bool_], camera: GroundCamera, pose: Array, size: Array, fall: Array | None
 ) -> Outlines:
-    """The outlines of a vehicle at poses (T, 3), of a size (3,), with what is dark beneath its paint if that is its
-    own, as those frames tell that were `used` (T,). Shadows fall `fall` (2,) m for each metre of height."""
-    along, across = np.moveaxis(_SIDES[outlines.corner].mean(axis=2), -1, 0)  # (T, K): where the rows' edges face
-    c, s = np.cos(pose[:, 2:]), np.sin(pose[:, 2:])
-    lit = (c * along - s * across) * fall[0] + (s * along + c * across) * fall[1] < 0
-    high = _height(outlines.dark[lit & used[:, None]])
+    """The outlines of a vehicle at poses (T, 3), of a size (3,), with what is its own beneath their border, as those
+    frames tell that were `used` (T,). Shadows fall `fall` (2,) m for each metre of height, where that is known."""
+    high, rows = 0.0, outlines.dark
+    if fall is not None:
+        lit = outlines.dark[used[:, None] & _sunny(outlines, pose, fall)]
+        high = _height(lit[~np.isnan(lit)])
+    if not high:
+        high, rows = _below_a_gap(outlines.paint[used]), outlines.paint
     if not high:
         return outlines
     down = wireframe.downwards(camera, pose, np.tile(size, (len(pose), 1)))
     below = high * np.einsum("tkc,ct->tk", outlines.normal, down)
-    return replace(outlines, support=outlines.support + np.where(np.isnan(outlines.dark), 0.0, below))
+    return replace(outlines, support=outlines.support + np.where(np.isnan(rows), 0.0, below))
 
 
-def _height(dark: Array) -> float:
-    """How high (m) the dark is by the rows (n,) that begin in it (see `Outlines`); 0 where it may be a shadow."""
-    told, endless = dark[np.isfinite(dark)], np.count_nonzero(np.isinf(dark))
+def _sunny(outlines: Outlines, pose: Array, fall: Array) -> NDArray[np.bool_]:
+    """Which rows (T, K) lie on edges that face the sun."""
+    along, across = np.moveaxis(_SIDES[outlines.corner].mean(axis=2), -1, 0)  # in the vehicle's axes
+    c, s = np.cos(pose[:, 2:]), np.sin(pose[:, 2:])
+    return np.asarray((c * along - s * across) * fall[0] + (s * along + c * across) * fall[1] < 0)
+
+
+def _height(found: Array) -> float:
+    """How far (m) below the border that ends which was found in rows (n,), inf where they do not tell; 0 where they do
+    not agree."""
+    told = found[np.isfinite(found)]
     if len(told) < LEAST_ROWS:
         return 0.0
     low, middle, high = np.quantile(told, (0.25, 0.5, 0.75))
-    alike = high - low < ALIKE * middle * len(told) / (len(told) + endless)
-    return float(middle) if middle > LOW_M and alike else 0.0
+    return float(middle) if middle > LOW_M and high - low < ALIKE * middle * len(told) / len(found) else 0.0
+
+
+def _below_a_gap(paint: Array) -> float:
+    """The same of the paint below (T, K), see `Outlines`; 0 where most rows see none."""
+    looked, found = paint[~np.isnan(paint)], paint[paint > 0]
+    return _height(found) if np.count_nonzero(np.isfinite(found)) > MOST * len(looked) else 0.0

@@ -149,7 +149,7 @@ def profiles(
     support = _dot(normal, at) + np.where(valid, nearest, 0.0)
     rows = np.ascontiguousarray(np.moveaxis(normal, 0, -1))
     none, unknown = np.zeros(len(pose), dtype=bool), np.full(valid.shape, np.nan)
-    outlines = Outlines(rows, support, EDGES[edge], share, valid, none, total / np.pi, unknown)
+    outlines = Outlines(rows, support, EDGES[edge], share, valid, none, total / np.pi, unknown, unknown)
     alone = np.abs(found[1] - nearest) < CLEAR_PX
     return Profiles(outlines, middle, at, normal, known, paint, ground, valid & (under | alone), valid & ~alone)
 
@@ -180,7 +180,8 @@ def search(
         again = np.flatnonzero(missing.any(axis=1) & (far > reach))
         wide = profiles(sights, code[again], camera, pose[again], size[again], far[again]).outlines
         outlines = _completed(outlines, again, missing[again], wide)
-    outlines = replace(outlines, dark=_dark(sights, code, camera, pose, size, outlines, across))
+    dark, paint = _beneath(sights, code, camera, pose, size, outlines, across)
+    outlines = replace(outlines, dark=dark, paint=paint)
     label, whose, inside = _look(sights, camera, _spokes(across.middle, across.at, _RADII))
     own = inside & (whose == code[:, None, None])
     area = _areas(across.middle, across.at, across.normal)[..., None] * np.ones(len(_RADII))
@@ -198,7 +199,7 @@ def search(
     )
 
 
-def _dark(
+def _beneath(
     sights: Sequence[Sight],
     code: NDArray[np.intp],
     camera: GroundCamera,
@@ -206,8 +207,8 @@ def _dark(
     size: Array,
     outlines: Outlines,
     across: Profiles,
-) -> Array:
-    """How high (N, K) m that is which looks like shadow and begins at the border on the ground: see `Outlines`."""
+) -> tuple[Array, Array]:
+    """What lies below the border on the ground: `dark` and `paint` (N, K) m, see `Outlines`."""
     down = wireframe.downwards(camera, pose, size)
     steep = _dot(across.normal, down[..., None])  # px along the normal for a metre down
     border = across.at + across.normal * (outlines.support - _dot(across.normal, across.at))
@@ -219,7 +220,11 @@ def _dark(
     found = (end > 0) & np.take_along_axis(known & (label == 0), end, axis=-1)
     height = np.where(found, depth[end] - depth[0] / 2, np.where(end > 0, np.inf, np.nan))[..., 0]
     asked = outlines.valid & across.ground & (steep > STEEP * _length(down)[:, None])
-    return np.where(asked, np.where(dark.all(axis=-1), np.inf, height), np.nan)
+    painted = known & (label == FOREGROUND)
+    last = SILL_STEPS - 1 - np.argmax(painted[..., ::-1], axis=-1)
+    told = known.all(axis=-1) & (last < SILL_STEPS - 1)
+    low = np.where(painted.any(axis=-1), np.where(told, depth[last] + depth[0] / 2, np.inf), 0.0)
+    return np.where(asked, np.where(dark.all(axis=-1), np.inf, height), np.nan), np.where(asked, low, np.nan)
 
 
 def _completed(outlines: Outlines, which: NDArray[np.intp], missing: NDArray[np.bool_], wide: Outlines) -> Outlines:

@@ -46,7 +46,8 @@ class Outlines:
     normal (N, K, 2), support (N, K), corner (N, K, 2), share (N, K), valid (N, K): the thing's own border was seen;
     tangent (N,): the corner is whichever lies outermost; width (N,) px: mean width of the outline; dark (N, K) m: how
     high above its end that begins where the row was seen which looks like shadow, inf where no end is seen, NaN where
-    nothing dark begins. One outline has the same fields without the first axis.
+    nothing dark begins; paint (N, K) m: how far below it the last paint is, 0 where there is none, inf where it may go
+    on, NaN where that was not looked for. One outline has the same fields without the first axis.
     """
 
     normal: Array
@@ -57,6 +58,7 @@ class Outlines:
     tangent: np.ndarray
     width: Array
     dark: Array
+    paint: Array
 
     def __getitem__(self, which: object) -> Outlines:
         return Outlines(*(getattr(self, name)[which] for name in self.__dataclass_fields__))
@@ -204,7 +206,7 @@ def tangents(hull: Array, at_border: np.ndarray, upright: bool = False, border_p
     nowhere = np.zeros((DIRECTIONS, 2), dtype=int)
     width = np.asarray(2 * support.mean())
     unknown = np.full(DIRECTIONS, np.nan)
-    return Outlines(FAN, support, nowhere, np.zeros(DIRECTIONS), valid, np.asarray(True), width, unknown)
+    return Outlines(FAN, support, nowhere, np.zeros(DIRECTIONS), valid, np.asarray(True), width, unknown, unknown)
 
 
 def fit(
