@@ -28,17 +28,16 @@ def on_the_ground(
 ) -> Outlines:
     """The outlines of a vehicle at poses (T, 3), of a size (3,), with what is its own beneath their border, as those
     frames tell that were `used` (T,). Shadows fall `fall` (2,) m for each metre of height, where that is known."""
-    high, rows = 0.0, outlines.dark
+    high, rows = 0.0, ~np.isnan(outlines.dark)
     if fall is not None:
-        lit = outlines.dark[used[:, None] & _sunny(outlines, pose, fall)]
-        high = _height(lit[~np.isnan(lit)])
+        high = _height(outlines.dark[rows & used[:, None] & _sunny(outlines, pose, fall)])
     if not high:
-        high, rows = _below_a_gap(outlines.paint[used]), outlines.paint
+        high, rows = _below_a_gap(outlines.paint, used)
     if not high:
         return outlines
     down = wireframe.downwards(camera, pose, np.tile(size, (len(pose), 1)))
     below = high * np.einsum("tkc,ct->tk", outlines.normal, down)
-    return replace(outlines, support=outlines.support + np.where(np.isnan(rows), 0.0, below))
+    return replace(outlines, support=outlines.support + np.where(rows, below, 0.0))
 
 
 def _sunny(outlines: Outlines, pose: Array, fall: Array) -> NDArray[np.bool_]:
@@ -58,7 +57,11 @@ def _height(found: Array) -> float:
     return float(middle) if middle > LOW_M and high - low < ALIKE * middle * len(told) / len(found) else 0.0
 
 
-def _below_a_gap(paint: Array) -> float:
-    """The same of the paint below (T, K), see `Outlines`; 0 where most rows see none."""
-    looked, found = paint[~np.isnan(paint)], paint[paint > 0]
-    return _height(found) if np.count_nonzero(np.isfinite(found)) > MOST * len(looked) else 0.0
+def _below_a_gap(paint: Array, used: NDArray[np.bool_]) -> tuple[float, NDArray[np.bool_]]:
+    """The same of the paint below (T, K), see `Outlines`, 0 where most rows see none; and the rows of the frames in
+    which most see it: in others the border may lie below the gap."""
+    looked, found = ~np.isnan(paint), paint > 0
+    told = np.count_nonzero(np.isfinite(paint[used]) & found[used])
+    high = _height(paint[used][found[used]]) if told > MOST * np.count_nonzero(looked[used]) else 0.0
+    frames = np.count_nonzero(found, axis=1) > MOST * np.count_nonzero(looked, axis=1)
+    return high, looked & frames[:, None]
