@@ -4,6 +4,7 @@ import cv2
 import numpy as np
 from masks import CAR, drive, evidence_of, labels_of, road_camera
 
+from visfuse_cli.maths.cameras import project
 from visfuse_cli.tracking import measure, sills
 from visfuse_cli.tracking.conclude import conclude
 from visfuse_cli.tracking.ground import GroundTracker
@@ -23,8 +24,7 @@ def fill_above(labels, pose, height, label):
     """Draw a car but for what is lower."""
     box = wireframe.corners(pose, CAR)
     box[:4, 2] = height
-    image = np.column_stack([box, np.ones(8)]) @ CAMERA.image_from_world.T
-    hull = cv2.convexHull((image[:, :2] / image[:, 2:]).astype(np.float32))
+    hull = cv2.convexHull(project(CAMERA, box)[0].astype(np.float32))
     cv2.fillConvexPoly(labels, np.round(hull * 16).astype(np.int32), label, shift=4)
 
 

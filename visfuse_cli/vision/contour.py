@@ -15,11 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from visfuse_cli.records import Array, GroundCamera, Image
-from visfuse_cli.vision import wireframe
 from visfuse_cli.vision.background import FOREGROUND, SHADOW
 from visfuse_cli.vision.labels import Labels
 from visfuse_cli.vision.lens import distort_points
-from visfuse_cli.vision.wireframe import DIRECTIONS, EDGES, Outlines, projected, silhouette_edges
+from visfuse_cli.vision.wireframe import DIRECTIONS, EDGES, Outlines, downwards, projected, silhouette_edges
 
 STEPS = 12  # places either side of the expected edge
 SURE = 4  # places either side of the found one that must agree
@@ -27,7 +26,7 @@ NOWHERE = -128  # fewer votes than any border has
 CLEAR_PX = 2.5  # between a border and the background outside it
 SOLID = 0.8  # of what lies inside a border must be paint to take what lies outside for shadow
 GROUND_EDGES = 4  # the first of the EDGES lie on the ground
-SILL_M, SILL_STEPS = 0.6, 24  # m below the paint at which the ground is looked for, where it is dark there
+SILL_M, SILL_STEPS = 0.6, 24  # m below the border, and places there, in which what else is a vehicle's is looked for
 STEEP = 0.4  # cosine of a border's normal and what is down in the picture, at least
 OPEN = 0.7  # of a profile that must be visible to expect a border in it
 BEYOND = 0.12  # of a silhouette's width: how far out the border of a box that is too small may lie
@@ -209,7 +208,7 @@ def _beneath(
     across: Profiles,
 ) -> tuple[Array, Array]:
     """What lies below the border on the ground: `dark` and `paint` (N, K) m, see `Outlines`."""
-    down = wireframe.downwards(camera, pose, size)
+    down = downwards(camera, pose, size)
     steep = _dot(across.normal, down[..., None])  # px along the normal for a metre down
     border = across.at + across.normal * (outlines.support - _dot(across.normal, across.at))
     depth = (np.arange(SILL_STEPS) + 1) * (SILL_M / SILL_STEPS)

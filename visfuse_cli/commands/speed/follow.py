@@ -165,8 +165,8 @@ class _Settling:
         if self.waiting and (last or sum(len(track.samples) for track in self.waiting) >= TOGETHER):
             shadow = self.detector.shadow
             fall = None if shadow is None else shadow.per_metre
-            lit = self.lamps.only_light
-            for taken in self.ledger.take(self.waiting, self.of, self.tracker.dynamics, lit, fall):
+            only_light = self.lamps.only_light
+            for taken in self.ledger.take(self.waiting, self.of, self.tracker.dynamics, only_light, fall):
                 self.spool.add(taken.record)
                 self.run.count("rejected" if taken.record["summary"]["rejected"] else "vehicles")
                 for identity in taken.displaced:
